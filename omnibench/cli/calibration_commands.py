@@ -183,7 +183,7 @@ def calibrate(
     shared.load_given_plugins(plugins)
     chosen = shared.chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
-    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
+    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ()
     with (
         redirect_stdout(sys.stderr),
         ProgressDisplay() as watch,
@@ -196,8 +196,7 @@ def calibrate(
         write_text(output, to_yaml(calibration))
     warn([*recordings.warnings, *run.warnings])
     if result.at_bounds:
-        when = "" if result.shrinkage is None else " before the answer was shrunk to the design"
-        warn([f"on a bound of the box {chosen.box!r}{when}: {', '.join(result.at_bounds)}; a wider box may fit better"])
+        warn([f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
     if run.untouched:
         warn([f"not fitted, kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"])
     if as_json:
@@ -208,7 +207,7 @@ def calibrate(
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
     print_verdict(calibration.provenance.held_out)
-    if result.at_bounds and result.shrinkage is None and output is not None:
+    if result.at_bounds and output is not None:
         what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
         return print_ending(what, "see what is", "omnibench", "check", *dataset)
     if output is None:

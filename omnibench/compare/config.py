@@ -138,14 +138,14 @@ class CompareConfig(NamedConfig):
     box: Box = "row"
     unidentified: Unidentified = Field(
         "keep",
-        description="what the data hardly tell: keep the design values of motions that they hardly drive, fit these to "
-        "slip and noise, or shrink every answer to the design in proportion to what is known",
+        description="what the data hardly tell: keep the design values of motions that they hardly drive, or fit these "
+        "to slip and noise; map weighs all against the design",
     )
     mount: MountChoice | None = Field(
         None, description="tracked point of a robot that cannot slide: known, or fitted; default: by the robot's class"
     )
     tolerance: Positive | None = Field(
-        None, description="of the design, share of each row's largest element, for shrink; default: the robot class's"
+        None, description="of the design, share of each row's largest element, for map; default: the robot class's"
     )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")

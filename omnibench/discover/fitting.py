@@ -35,6 +35,7 @@ from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog, split_by
+from omnibench.robot.physical import EstimatedCovariance
 
 _ENOUGH = 30  # runs that are not cut: signs of fewer are flipped in too few ways for chances of 0.002 to be known well
 _MOST = 60  # windows of all drives, at most; chosen
@@ -408,7 +409,7 @@ class Extended:
     data: fits.Whitened
     columns: tuple[Array, ...]
     values: Array
-    covariance: fits.EstimatedCovariance
+    covariance: EstimatedCovariance
 
     @property
     def residuals_without_effects(self) -> list[Array]:

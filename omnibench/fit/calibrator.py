@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -117,15 +118,16 @@ def as_answered(
     """How answers are treated: as asked for, unless they stand as they are or weigh the design by themselves."""
     if calibrator.as_is:
         return "fit", "fit"
-    return "fit" if calibrator.weighs_design else unidentified, mount
-
-
-@dataclass(frozen=True)
-class Shrinkage:
-    """An answer's shrinkage to the design: its cost before, and the source of the covariance after, in words."""
-
-    unshrunk_cost: float
-    source: str
+    if calibrator.weighs_design:
+        return "fit", mount
+    if unidentified == "shrink":
+        warnings.warn(
+            f"unidentified: shrink is what calibrator map does by itself; {calibrator.name} keeps the design instead",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return "keep", mount
+    return unidentified, mount
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ class RunResult(Brief):
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
     covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
-    shrinkage: None where the answer is the calibrator's own. timing: None where the seconds are not to be compared.
+    timing: None where the seconds are not to be compared.
     extension: effects that belong to the answer beside the matrix, None for none.
     """
 
@@ -159,7 +161,6 @@ class RunResult(Brief):
     covariance: JsonArray | None = None
     noise: saved.Noise | None = None
     degrees_of_freedom: JsonArray | None = None
-    shrinkage: Shrinkage | None = None
     timing: Timing | None = None
     extension: saved.ModelExtension | None = None
 

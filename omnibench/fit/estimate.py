@@ -1,10 +1,10 @@
 """The most probable odometry model of a robot: by its references, and by what is known of its design.
 
 The unknowns u are independent standard normal numbers before the robot has been driven. They are what the matrix K has
-beyond its design K0, by a root L of the class's prior (prior.py), the parameters b of effects beside the matrix, and the
-offsets of gyros, one a session:
+beyond its design K0, by a root L of the class's prior (prior.py), the parameters b of effects beside the matrix, and
+the offsets of gyros, one a session:
 
-    K = K0 + L z,    b = s e,    u = (z, e, o).                                                            (1)
+    K = K0 + L z,    b = b0 + s e,    u = (z, e, o).                                                            (1)
 
 Everything that was observed is a row of errors r of x, y and heading (or of a length, or an angle), predicted less
 observed, which has the standard deviation sigma by what measured it. A run's poses are cut into five stretches of its
@@ -40,12 +40,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import DataError
+from omnibench.errors import ConfigError, DataError
 from omnibench.fit.loss import Loss, LossName, Squares, make_loss
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
+from omnibench.registry import effects
 from omnibench.robot.corrections import corrected, needs_of
 from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
@@ -58,8 +58,9 @@ _STRETCHES = 5  # stretches that a run's path is cut into; chosen
 _POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady; chosen
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
 _LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
-_MOST_STEPS, _RESTING = 40, 1e-5  # steps, and the largest step, in prior deviations, that counts as none
-_UNTOLD = 1e3  # times its sigma counts a position of a run that hardly leaves its place, and so tells no heading; chosen
+_STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
+_MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
+_UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
 PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
 
 
@@ -67,15 +68,13 @@ PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
 class Unknown:
     """A parameter of an effect on wheels or steering that is estimated beside the matrix.
 
-    deviation: its standard deviation before the robot has been driven. step: by which it is moved for its derivative.
-    start: where the search begins.
+    middle, deviation: mean and standard deviation of its prior, in the parameter's unit.
     """
 
     effect: str
     parameter: str
     deviation: float
-    step: float
-    start: float = 0.0
+    middle: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,6 +111,11 @@ class Estimate:
     steps: int
     at_rest: bool
 
+    @property
+    def error(self) -> float:
+        """The product of the excess errors: the smaller, the better the runs are explained."""
+        return float(np.prod(list(self.excess.values())))
+
 
 @dataclass(frozen=True, eq=False)
 class EstimateProblem:
@@ -135,9 +139,39 @@ class EstimateProblem:
         design, count = self.robot.inverse_kinematic_matrix, self.root.shape[1]
         by_effect: dict[str, dict[str, float]] = {}
         for unknown, share in zip(self.unknowns, unknowns[count:].tolist(), strict=False):
-            by_effect.setdefault(unknown.effect, {})[unknown.parameter] = share * unknown.deviation
+            value = unknown.middle + share * unknown.deviation
+            by_effect.setdefault(unknown.effect, {})[unknown.parameter] = value
         terms = tuple(make_term(name, parameters, self.robot) for name, parameters in by_effect.items())
         return design + (self.root @ unknowns[:count]).reshape(design.shape), terms
+
+
+STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
+# Factors on the measured angle about which a gain is looked for: gears between an encoder and its wheel are seldom
+# known worse than this, and between two of them the errors have one minimum (tests/fit/test_wheeled_fits.py).
+_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
+
+
+def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
+    """Gain, play and coupling of a robot's steering, or a car's zero; a gain's prior about each of some factors.
+
+    Their plausible ranges are their standard deviations. A lag is not among them: a wrong clock of the reference looks
+    alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
+    """
+    parameters = [
+        (effect.name, parameter)
+        for effect in map(effects.create, STEERING)
+        if effect.applies(robot)
+        for parameter in effect.parameters(robot)
+    ]
+    if not parameters:
+        raise ConfigError(f"steering: fit is for wheels that steer; robot {robot.name} has none")
+    return [
+        tuple(
+            Unknown(name, parameter.name, parameter.largest, (factor - 1) * (name == STEERING[0]))
+            for name, parameter in parameters
+        )
+        for factor in _FACTORS
+    ]
 
 
 def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True) -> Estimate:
@@ -146,9 +180,10 @@ def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda
     may_go_on: asked before each step but the first, with the number of those that were made.
     """
     rows, loss = _Rows(problem), make_loss(problem.loss, 3) or Squares(3)
-    effects = [unknown.start / unknown.deviation for unknown in problem.unknowns]
-    unknowns = np.concatenate([np.zeros(problem.root.shape[1]), effects, np.zeros(rows.gyros)])
-    weights, excess, steps, at_rest = np.ones(len(rows.run)), np.full(len(rows.kinds), _FIRST), 0, False
+    unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
+    excess: Array = np.full(len(rows.kinds), _FIRST)
+    weights: Array = np.ones(len(rows.run))
+    steps, at_rest = 0, False
     while steps < _MOST_STEPS and not at_rest and (not steps or may_go_on(steps)):
         errors, slopes, drifts = rows.linearised(unknowns)
         errors = rows.without_nuisances(errors, drifts, weights[:, None] * rows.precisions(excess))
@@ -161,7 +196,7 @@ def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda
         unknowns, steps = unknowns + step, steps + 1
         at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
     matrix, terms = problem.answer(unknowns)
-    root = np.zeros((matrix.size + len(effects), len(unknowns)))
+    root = np.zeros((matrix.size + len(problem.unknowns), len(unknowns)))
     root[: matrix.size, : problem.root.shape[1]] = problem.root
     for number, unknown in enumerate(problem.unknowns):
         root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
@@ -227,11 +262,11 @@ class _Rows:
         matrix, terms = problem.answer(unknowns)
         errors, jacobian, drifts = self._of_model(matrix, terms)
         columns = [jacobian @ problem.root]
-        for number, unknown in enumerate(problem.unknowns):
+        for number in range(len(problem.unknowns)):
             moved = unknowns.copy()
-            moved[count + number] += unknown.step / unknown.deviation
+            moved[count + number] += _STEP
             further, _, _ = self._of_model(*problem.answer(moved), slopes=False)
-            columns.append(((further - errors) * (unknown.deviation / unknown.step))[..., None])
+            columns.append(((further - errors) / _STEP)[..., None])
         offsets = unknowns[count + len(problem.unknowns) :]
         return errors + self._offsets @ offsets, np.concatenate([*columns, self._offsets], axis=2), drifts
 
@@ -323,9 +358,7 @@ class _Rows:
         values = -np.linalg.solve(inner, along)[..., 0]
         return errors + np.einsum("scm,sm->sc", drifts, values[self.run])
 
-    def normal_equations(
-        self, errors: Array, slopes: Array, drifts: Array, precisions: Array
-    ) -> tuple[Array, Array]:
+    def normal_equations(self, errors: Array, slopes: Array, drifts: Array, precisions: Array) -> tuple[Array, Array]:
         """Hessians (Z, k, k) and slopes (Z, k) of half of the runs' parts of Eq. (3), nuisances eliminated.
 
         errors (S, 3): with nuisances at their likeliest.

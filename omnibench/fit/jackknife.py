@@ -1,7 +1,7 @@
 """Intervals: a jackknife over clusters of runs, Student's t, and the prior's own part.
 
-What an estimate has minimised is a sum over clusters of runs, and perhaps a prior's part. With a cluster's slope g_c and
-Hessian H_c at the minimum, and the Hessian H of all, one Gauss-Newton step leads to the minimum without the cluster:
+What an estimate has minimised is a sum over clusters of runs, and perhaps a prior's part. With a cluster's slope g_c
+and Hessian H_c at the minimum, and the Hessian H of all, one Gauss-Newton step leads to the minimum without it:
 
     d_c = (H - H_c)^-1 g_c.                                                                                (1)
 
@@ -35,7 +35,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import MANY, EstimatedCovariance
 from omnibench.words import plural
 
-FEWEST_SESSIONS = 3  # sessions that are clusters: the 95 % interval of two would reach 13 standard errors to either side
+FEWEST_SESSIONS = 3  # that are clusters: the 95 % interval of two would reach 13 standard errors to either side
 _LEAST_LEFT = 0.1  # share of what is known of a direction that other clusters must say, too; chosen
 _ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
 
@@ -104,7 +104,8 @@ def jackknife(information: Array, scores: Array, clusters: Clusters, prior: Arra
             scatter = scatter + ratio * alone @ (alone.T @ of_data @ alone) @ alone.T
     shares = np.diag(roots @ scatter @ roots.T), np.diag(roots @ (scatter + own) @ roots.T)
     of_scatter = np.clip(shares[0] / np.maximum(shares[1], 1e-300), 1e-9, 1.0)
-    freedom = np.minimum(max(count - 1, 1) / np.square(of_scatter), MANY)  # Satterthwaite 1946: the prior's part is exact
+    # The prior's part is exact, so that the scatter's share in the variance says its freedom (Satterthwaite 1946)
+    freedom = np.minimum(max(count - 1, 1) / np.square(of_scatter), MANY)
     return EstimatedCovariance(roots @ (scatter + own) @ roots.T, freedom if count > 1 else MANY)
 
 

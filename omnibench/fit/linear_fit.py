@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.data.stored import median_period
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.estimate import EstimateProblem, estimate
 from omnibench.fit.prior import default_cost, physical_prior_root, physical_tolerance

@@ -72,6 +72,7 @@ from omnibench.fit.noise import common_poses, grouped, roots_of, whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.physical import INTERVAL
 from omnibench.words import plural
 
 # Share of a command's median duration that a run must last: a shorter one would cut all others (chosen).

@@ -13,11 +13,10 @@ from rich.console import Console
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import ConfigError
-from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
-from omnibench.fit.paths import PathError
+from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
@@ -43,8 +42,11 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
         console.print(f"cost of the calibration      {certificate.cost:.9f}")
     else:
         console.print(f"cost of the calibration      {certificate.cost * (1 + certificate.shrinking):.9f}")
-        console.print(f"cost before it was shrunk    {certificate.cost:.9f}")
-        console.print(f"Shrinking it to the design adds {certificate.shrinking:.2%} to the cost.", soft_wrap=True)
+        console.print(f"optimum of the matrix alone  {certificate.cost:.9f}")
+        console.print(
+            f"The calibration weighs the design, or has effects: its cost differs by {certificate.shrinking:+.2%}.",
+            soft_wrap=True,
+        )
     if proof.best_cost < certificate.cost:
         console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
     console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
@@ -71,8 +73,6 @@ def print_calibration(console: Console, run: CalibrationRun, others: int = _ENDI
     """
     lines = [f"{run.result.outcome}: {run.result.reason}; {plural(run.result.evaluations, 'evaluation')}"]
     lines[0] += f", {run.result.seconds:.2f} s"
-    if run.intervals is not None:
-        lines.append(f"95 % intervals, resampled: {run.units.words}")
     if run.uncertainty is not None:
         lines.insert(0, f"95 % intervals: {run.uncertainty.source}")
         if run.calibration.noise is not None:
@@ -82,7 +82,7 @@ def print_calibration(console: Console, run: CalibrationRun, others: int = _ENDI
     tables = [_parameter_table(run)] if run.parameters else []
     room = _SCREEN - others - sum(_height(console, table) for table in tables)
     wide, narrow = _matrix_table(run, intervals=True), _matrix_table(run, intervals=False)
-    chosen = wide if run.intervals is not None or _height(console, wide) + sum(heights) <= room else narrow
+    chosen = wide if _height(console, wide) + sum(heights) <= room else narrow
     room -= _height(console, chosen)
     for table in (*tables, chosen):
         print_table(console, table)
@@ -132,8 +132,6 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
     notes, listed = [], list[tuple[str, ElementIntervals]]()
     if run.uncertainty is not None and intervals:
         listed.append(("95 %", run.uncertainty.intervals))
-    if run.intervals is not None:
-        listed.append(("95 %, resampled", run.intervals))
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
@@ -239,32 +237,6 @@ def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
             "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
         )
         print_table(console, Table("errors by kind of reference", headings, tuple(rows), note))
-
-
-def print_path_errors(console: Console, errors: Sequence[PathError], calibration: Calibration) -> None:
-    """Print the errors to expect at the ends of paths, with what holds 95 % of them; nothing where there are none."""
-    rows = []
-    for path in dict.fromkeys(error.path for error in errors):
-        by_model = {error.model: error for error in errors if error.path == path}
-        both = (by_model["design"], by_model["calibration"])
-        places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
-        turns = (
-            f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both
-        )
-        rows.append(Row.of(path, *places, *turns))
-    columns = (
-        Column("path", numeric=False),
-        *(Column(f"position, {model}", "mm") for model in ("design", "calibration")),
-        *(Column(f"heading, {model}", "deg") for model in ("design", "calibration")),
-    )
-    runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
-    if rows:
-        print_table(console, Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows)))
-
-
-def _figures(value: float) -> str:
-    """A number with two figures, or all before its point."""
-    return f"{value:.1f}" if value < 10 else f"{value:.0f}"  # noqa: PLR2004 (two figures)
 
 
 def _size(value: float, unit: str) -> str:

@@ -7,6 +7,7 @@ wheel loses or gains (``wheel_dead_zone``): rollers creep, tyres slip in turns.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from pydantic import Field, model_validator
 from omnibench.config import NonNegative, Positive
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.estimate import Estimate, EstimateProblem, Nuisances, Unknown, estimate
+from omnibench.fit.estimate import Estimate, EstimateProblem, Nuisances, Unknown, estimate, steering_unknowns
 from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
@@ -24,7 +25,6 @@ from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
 
 _EFFECT, _PARAMETER = "wheel_dead_zone", "c"
-_STEP = 0.1  # share of the prior's deviation by which the lost rate is moved for its derivative
 _MOST_STEPS = 40  # of the estimate, for its progress
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
@@ -44,11 +44,12 @@ class MapOptions(Options):
     )
     clock_offset: Positive = Field(0.1, description="its expected size, s")
     clock_slope: Positive = Field(0.003, description="its expected size, s per s")
+    steering: Literal["known", "fit"] = Field("known", description="fit: also its gain, play and coupling, or zero")
 
     @model_validator(mode="before")
     @classmethod
     def _without_former_options(cls, content: Any) -> Any:
-        """Take options of trajectory_ml: a start that is exact has no deviation, and the others have no use any more."""
+        """Take options of trajectory_ml: an exact start has no deviation, and the others have no use any more."""
         if not isinstance(content, dict):
             return content
         exact = {"start_heading": 0.0} if content.get("start") == "exact" else {}
@@ -71,6 +72,8 @@ class Map(Calibrator):
         self.needs_matrix(problem)
         robot, options = problem.robot, self.options
         tolerance = physical_tolerance(robot)
+        if problem.tolerance is not None:  # of the elements, and nothing else
+            tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
@@ -92,19 +95,25 @@ class Map(Calibrator):
             problem.report(steps, _MOST_STEPS, "step")
             return problem.seconds_left > 0
 
-        found = most_probable((Unknown(_EFFECT, _PARAMETER, lost, _STEP * lost),) if lost else ())
+        of_wheels = (Unknown(_EFFECT, _PARAMETER, lost),) if lost else ()
+        if options.steering == "fit":
+            steered = steering_unknowns(robot)
+            found = min((most_probable((*of_wheels, *unknowns)) for unknowns in steered), key=lambda tried: tried.error)
+        else:
+            found = most_probable(of_wheels)
         clusters = Clusters.of(problem.trajectories)
         unit = np.eye(found.root.shape[1])
         covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
         end = f"{'' if found.at_rest else 'not '}at rest after {found.steps} steps"
         extension, size = None, found.matrix.size
-        if lost:
-            rate = float(found.terms[0].values[_PARAMETER])
+        if found.terms:
             extension = ModelExtension(
                 effects=tuple(map(EffectTerm.of, found.terms)),
                 covariance=covariance_rows(covariance.matrix),
                 plain=matrix_rows(most_probable(()).matrix),
             )
+        if lost:
+            rate = float(found.terms[0].values[_PARAMETER])
             end += f"; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
         if not np.isfinite(problem.cost(found.matrix.reshape(1, -1))).all():
             raise DataError("the cost of its answer is not finite")
