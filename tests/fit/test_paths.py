@@ -200,7 +200,8 @@ def test_simulated_drives_end_within_their_regions_as_often_as_these_say() -> No
     held = {"position": 0, "heading": 0}
     drives = 0
     for _ in range(5):
-        truth = DIFFERENTIAL.inverse_kinematic_matrix * (1 + 0.01 * rng.normal(size=(3, 2)))
+        radii, track = 0.01 * rng.normal(size=2), 0.02 * rng.normal()
+        truth = DIFFERENTIAL.inverse_kinematic_matrix * (1 + radii) * [[1.0], [1.0], [1 + track]]
         runs = []
         for number in range(24):
             times = np.arange(1, 201) * PERIOD

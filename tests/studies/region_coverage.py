@@ -1,8 +1,8 @@
 """How many held-out runs of real robots end within the 95 % error regions that a calibration predicts for their paths.
 
-``python tests/studies/region_coverage.py [DATA]`` fits ``map`` to every training of configs/real_robots.yaml and judges it
-on the runs that the study holds out: DATA is the folder of the recordings, by default the config's. Each run is judged by
-the region of its own path, with what its start and its reference err by.
+``python tests/studies/region_coverage.py [DATA]`` fits ``map`` to every training of configs/real_robots.yaml and judges
+it on the runs that the study holds out. DATA is the folder of the recordings, by default the config's. Each run is
+judged by the region of its own path, with what its start and its reference err by.
 
 A share counts every training > judged kind of a robot alike. Runs of a command err alike, so that the exact binomial
 intervals count commands, not runs. factor: that with which 95 % of the runs of all other robots lie in the regions;
