@@ -246,7 +246,7 @@ def evaluate(
     the expected error at its end and the region that holds 95 % of errors. Without DATASET the paths alone.
     """
     from omnibench.cli.terminal.calibration_tables import print_evaluation, print_path_errors, print_verdict_ending
-    from omnibench.fit.paths import predicted_errors, regions_lack
+    from omnibench.fit.path_errors import predicted_errors, regions_lack
 
     shared.load_given_plugins(plugins)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)

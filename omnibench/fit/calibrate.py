@@ -17,7 +17,7 @@ from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.open_combinations import open_sentences
-from omnibench.fit.paths import slip_of
+from omnibench.fit.path_errors import slip_of
 from omnibench.fit.prior import default_cost, default_mount, physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings

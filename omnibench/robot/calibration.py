@@ -62,7 +62,7 @@ _Parameters = Annotated[
 class Slip(config.Model):
     """Scatter of the ends of training runs about the calibrated odometry, which no calibration takes away.
 
-    Standard deviations per root metre that the wheels roll; see fit/paths.py.
+    Standard deviations per root metre that the wheels roll; see fit/path_errors.py.
     """
 
     heading: Deviation = Field(description="of the heading, rad")

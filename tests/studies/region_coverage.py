@@ -22,7 +22,7 @@ from scipy.stats import beta
 
 from omnibench.compare.plan import PlannedRun
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.paths import EndErrors, error_region, slip_of
+from omnibench.fit.path_errors import EndErrors, error_region, slip_of
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot.calibration import Calibration, matrix_rows
 from omnibench.study.config import MethodChoice

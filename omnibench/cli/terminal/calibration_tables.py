@@ -16,7 +16,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
-from omnibench.fit.paths import PathError
+from omnibench.fit.path_errors import PathError
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import noise_in_words

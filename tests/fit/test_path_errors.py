@@ -12,16 +12,12 @@ from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.paths import (
+from omnibench.fit.path_errors import (
     EndErrors,
     error_region,
-    legs_of,
     predicted_errors,
     regions_lack,
     slip_of,
-    tightest_arc,
-    usual_paths,
-    wheel_log,
 )
 from omnibench.robot.calibration import (
     Calibration,
@@ -34,6 +30,7 @@ from omnibench.robot.calibration import (
 )
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import PathBatch, RunSamples, WheelLog
+from omnibench.robot.paths import legs_of, tightest_arc, usual_paths, wheel_log
 
 PERIOD = 0.05
 SLIP = Slip(heading=0.01, way=0.008, position=0.004, runs=20)
