@@ -348,7 +348,8 @@ def export(
     exported = omnibench.export_calibration(omnibench.read_calibration(calibration), to)
     file = output / exported.file_name if output is not None and output.is_dir() else output
     refuse_existing(file, force=force)
-    warn(exported.warnings)
+    # What is printed holds its warnings, which a terminal need not show twice
+    warn([warning for warning in exported.warnings if file is not None or warning not in exported.text])
     if file is None:
         typer.echo(visible(exported.text), nl=False)
         print_ending(f"{to}: printed, not written", "write it to a file with -o FILE")

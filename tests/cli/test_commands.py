@@ -128,9 +128,10 @@ def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command
 
 
 def test_what_only_a_live_node_can_run_is_not_exported(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    plain = read_calibration(prepared.calibration)
-    term = EffectTerm(name="wheel_dead_zone", parameters={"c": -0.001})
-    write_calibration(plain.model_copy(update={"effects": (term,), "covariance": None}), tmp_path / "effects.yaml")
+    fitted = read_calibration(prepared.calibration)
+    term = EffectTerm(name="centripetal_slip", parameters={"k": -0.001})
+    effects = {"effects": (term,), "covariance": None, "plain": None}
+    write_calibration(fitted.model_copy(update=effects), tmp_path / "effects.yaml")
     ending = command("evaluate", tmp_path / "effects.yaml", prepared.data).stderr
     assert ending.endswith(":\n  omnibench guide live\n")
     assert " export " in command("evaluate", prepared.calibration, prepared.data).stderr

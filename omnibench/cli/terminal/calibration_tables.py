@@ -288,7 +288,7 @@ def print_verdict_ending(
 
 def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
     """The next step with a calibration in words, then the words to type: an export, or a node if none holds it."""
-    if left_out(calibration):
+    if calibration.plain is None and left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
     # The format to try first: parameters of a ROS 2 controller where one suits the robot.
     export_format = "ros2_controllers"
