@@ -240,7 +240,7 @@ def evaluate(
     plugins: shared.Plugins = None,
     as_json: shared.Json = False,
 ) -> None:
-    """Show the errors of a calibration on a data set, and those to expect on paths.
+    """Show a calibration's errors on a data set, and those on paths.
 
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values. On each path:
     the expected error at its end and the region that holds 95 % of errors. Without DATASET the paths alone.
