@@ -11,9 +11,9 @@ from dataclasses import fields
 from html import escape
 from importlib import import_module
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
-from omnibench.errors import require_choice
+from omnibench.errors import ConfigError, require_choice
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -79,8 +79,12 @@ class Shown:
         table = next(iter(_view(self).tables().values()))()
         return f"<div><b>{first}</b>{below}</div>{table.head(_ROWS)._repr_html_()}"
 
-    def to_frame(self, table: str | None = None) -> pl.DataFrame:
-        """One of the object's tables as a Polars data frame, in SI units; default: the first.
+    @overload
+    def to_frame(self, table: str | None = None, *, pandas: Literal[False] = False) -> pl.DataFrame: ...
+    @overload
+    def to_frame(self, table: str | None = None, *, pandas: bool) -> Any: ...
+    def to_frame(self, table: str | None = None, *, pandas: bool = False) -> Any:
+        """One of the object's tables as a data frame of Polars, or of pandas, in SI units; default: the first.
 
         Of a data set: trajectories, wheels, poses, references. A trajectory: wheels, poses, references. A robot:
         wheels. A calibration and a run of ``calibrate``: matrix, parameters. An evaluation: splits, references. A
@@ -90,7 +94,7 @@ class Shown:
         tables = _view(self).tables()
         name = next(iter(tables)) if table is None else table
         require_choice("table", name, tables)
-        return tables[name]()
+        return as_pandas(tables[name]()) if pandas else tables[name]()
 
     def plot(self, **options: Any) -> go.Figure:
         """The object as a Plotly figure.
@@ -109,6 +113,15 @@ class Shown:
 
     def _lines(self) -> list[str]:
         return screenful(_view(self).lines())
+
+
+def as_pandas(frame: pl.DataFrame) -> Any:
+    """A Polars frame as a pandas one. ConfigError: pandas is not installed."""
+    try:
+        from pandas import DataFrame
+    except ImportError:
+        raise ConfigError('pandas is not installed; pip install "omnibench[pandas]"') from None
+    return DataFrame({column.name: column.to_list() for column in frame.iter_columns()})
 
 
 def brief(name: str, values: Iterable[tuple[str | None, Any]]) -> str:

@@ -163,6 +163,11 @@ def calibrate(
     output: Annotated[
         Path | None, shared.output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
+    ] = None,
+    figures: shared.Figures = None,
     backend: shared.BackendName = None,
     workers: shared.Workers = None,
     tls_ca: shared.TlsAuthority = None,
@@ -179,10 +184,12 @@ def calibrate(
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
     from omnibench.config import parse_settings, to_yaml
+    from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
     chosen = shared.chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
+    shared.refuse_report(report, figures, force=force)
     tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ()
     with (
         redirect_stdout(sys.stderr),
@@ -194,26 +201,38 @@ def calibrate(
     calibration, result = run.calibration, run.result
     if output is not None:
         write_text(output, to_yaml(calibration))
-    warn([*recordings.warnings, *run.warnings])
+    warnings = [*recordings.warnings, *run.warnings]
     if result.at_bounds:
-        warn([f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}; a wider box may fit better"])
+        bounds = f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}"
+        warnings.append(f"{bounds}; a wider box may fit better")
     if run.untouched:
-        warn([f"not fitted, kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"])
-    if as_json:
-        return print_json(calibration)
-    print_calibration(make_console(), run)
-    if output is not None:
-        typer.echo(f"calibration: {output}")
+        held = f"kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"
+        warnings.append(f"not fitted, {held}")
+    warn(warnings)
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
-    print_verdict(calibration.provenance.held_out)
+    verdict = calibration.provenance.held_out
+    shared.write_asked_report(
+        lambda: calibration_document(calibration, recordings, verdict, run.warnings), report, figures, announced=True
+    )
+    if as_json:
+        return print_json(calibration)
+    file = [] if output is None else [f"calibration: {output}"]
+    ending = [
+        "whether it is better, and what to do next, in a line that is longer than many terminals are wide",
+        "COMMAND",
+    ]
+    room = print_calibration(make_console(), run, [*warnings, *file, verdict.sentence, *ending], verdict.detail)
+    for line in file:
+        typer.echo(line)
+    print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
     if result.at_bounds and output is not None:
         what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
         return print_ending(what, "see what is", "omnibench", "check", *dataset)
     if output is None:
         again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
         return print_ending("the calibration above is written nowhere", "write it to a file", *again)
-    return print_verdict_ending(calibration.provenance.held_out, calibration, output, dataset)
+    return print_verdict_ending(verdict, calibration, output, dataset)
 
 
 @calibration_app.command()
@@ -232,11 +251,17 @@ def evaluate(
             '"square 1.0 right" (its side); may be repeated.',
         ),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
+    ] = None,
+    figures: shared.Figures = None,
     backend: shared.BackendName = None,
     workers: shared.Workers = None,
     tls_ca: shared.TlsAuthority = None,
     tls_cert: shared.TlsCertificate = None,
     tls_key: shared.TlsKey = None,
+    force: shared.Force = False,
     plugins: shared.Plugins = None,
     as_json: shared.Json = False,
 ) -> None:
@@ -247,8 +272,12 @@ def evaluate(
     """
     from omnibench.cli.terminal.calibration_tables import print_evaluation, print_path_errors, print_verdict_ending
     from omnibench.fit.path_errors import predicted_errors, regions_lack
+    from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
+    shared.refuse_report(report, figures, force=force)
+    if not dataset and (report or figures):
+        raise ConfigError("--report and --figures show recordings: name a data set, too")
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         evaluated = omnibench.read_calibration(calibration)
@@ -259,6 +288,9 @@ def evaluate(
     if recordings is not None and evaluation is not None:
         warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
     warn(warnings)
+    if recordings is not None and evaluation is not None:
+        of_data = recordings, evaluation.held_out, evaluation.warnings
+        shared.write_asked_report(lambda: calibration_document(evaluated, *of_data), report, figures, announced=True)
     if as_json:
         document = {} if evaluation is None else evaluation.model_dump()
         return print_json(document | {"paths": [error.model_dump() for error in predicted], "warnings": warnings})

@@ -62,11 +62,12 @@ class CalibratorEntry(Model):
 
     def settings(self, common: FitSettings) -> CompleteSettings:
         """The settings of the entry's fit: those common to a comparison, with its own and its calibrator's."""
-        calibrator = calibrators.entry(self.name).cls
+        entry = calibrators.entry(self.name)
+        calibrator = entry.cls
         assert common.unidentified is not None  # a comparison says it
         unidentified, mount = as_answered(calibrator, common.unidentified, common.mount)
         of_entry = {
-            "calibrator": self.name,
+            "calibrator": entry.name,
             "options": self.options,
             "parameterisation": self.parameterisation or calibrator.parameterisation,
             "box": self.box or common.box,

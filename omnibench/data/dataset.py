@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -31,7 +31,8 @@ from omnibench.data.references import (
 )
 from omnibench.data.scans import Scans
 from omnibench.data.stored import Flaw, Table
-from omnibench.errors import DataError, nearest, require_type
+from omnibench.errors import DataError, UnknownNameError, nearest, require_type
+from omnibench.robot.arrays import frame_of
 from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
 from omnibench.robot.model import OdometryModel
@@ -205,6 +206,23 @@ class Dataset(Shown):
     referenced: bool = True
     imported: Imported | None = None
 
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return iter(self.trajectories)
+
+    def __contains__(self, name: object) -> bool:
+        return any(run.id == name for run in self.trajectories)
+
+    def __getitem__(self, name: str | int) -> Trajectory:
+        """A run by its id, or by its number from 0 on. UnknownNameError, IndexError: there is none."""
+        if not isinstance(name, str):
+            return self.trajectories[name]
+        if name not in self:
+            raise UnknownNameError("run", name, (run.id for run in self.trajectories), f"data set {self.name}")
+        return next(run for run in self.trajectories if run.id == name)
+
     def split(self, name: Split) -> tuple[Trajectory, ...]:
         """The trajectories of one split; may be empty. Copies of training runs are not for validation."""
         return tuple(run for run in self.trajectories if run.split == name and run.id not in self.copies)
@@ -295,12 +313,12 @@ def make_dataset(
     else:
         required = stored.REQUIRED | {"wheels": stored.required_columns(robot)}
         given = {"wheels": wheels, "poses": poses, "references": references}
-        frames = {key: _frame(key, content) for key, content in given.items() if content is not None}
+        frames = {key: frame_of(key, content) for key, content in given.items() if content is not None}
         if all("trajectory" not in frame.columns for frame in frames.values()):
             frames = {key: frame.with_columns(pl.lit(_ONLY_RUN).alias("trajectory")) for key, frame in frames.items()}
         tables = {key: Table(Path(key), frame, required[key]) for key, frame in frames.items()}
         named = tables["wheels"].frame["trajectory"].unique(maintain_order=True)
-        listed = _frame("trajectories", {"trajectory": named} if trajectories is None else trajectories)
+        listed = frame_of("trajectories", {"trajectory": named} if trajectories is None else trajectories)
         if "split" not in listed.columns:
             commands = listed["command"].to_list() if "command" in listed.columns else [None] * len(listed)
             listed = listed.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
@@ -356,25 +374,6 @@ def _checked(place: str, robot: Robot, run: Any) -> Trajectory:
         if flaw is not None:
             raise DataError(f"{where}: {name}, row {flaw[0] + 1}: {flaw[1]}")
     return replace(run, **changed) if changed else run
-
-
-def _frame(name: str, content: Any) -> pl.DataFrame:
-    """A data frame or a dict of columns as a Polars frame. DataError names the table and the column that is unfit."""
-    if isinstance(content, pl.DataFrame):
-        return content
-    names = content if isinstance(content, Mapping) else getattr(content, "columns", None)  # as pandas has them
-    if names is None:
-        raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
-    arrays = {str(column): np.atleast_1d(np.asarray(content[column])) for column in names}
-    for column, array in arrays.items():
-        first = next(iter(arrays))
-        if array.ndim != 1:
-            raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
-        if len(array) != len(arrays[first]):
-            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {len(arrays[first])}")
-    return pl.DataFrame(
-        {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
-    )
 
 
 def check_runs(runs: Table) -> Table:

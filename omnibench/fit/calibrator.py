@@ -17,7 +17,7 @@ from omnibench.errors import ConfigError, DataError, NotApplicableError, Omniben
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Treatment, Unidentified
 from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot import calibration as saved
@@ -71,7 +71,7 @@ class Calibrator(ABC):
     uses: files or rooms of omnibench (``discover``) and packages whose change may change its answers, beside
     those that all calibrators share; stored runs are then not taken for new ones.
     exact: True if a converged answer is a minimum to rounding, against which others are measured; that it is the
-    optimum of the box is not said by this but by a proof (certify.py).
+    optimum of the box is not said by this but by a proof, that of ``certify``.
     """
 
     Options: ClassVar[type[BaseModel]] = Options
@@ -114,12 +114,12 @@ calibrators.contract = Calibrator
 
 def as_answered(
     calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
-) -> tuple[Unidentified, MountChoice | None]:
+) -> tuple[Treatment, MountChoice | None]:
     """How answers are treated: as asked for, unless they stand as they are or weigh the design by themselves."""
     if calibrator.as_is:
         return "fit", "fit"
     if calibrator.weighs_design:
-        return "fit", mount
+        return "weigh", mount
     if unidentified == "shrink":
         warnings.warn(
             f"unidentified: shrink is what calibrator map does by itself; {calibrator.name} keeps the design instead",

@@ -543,7 +543,7 @@ def certify_optimum(
     cost = problem.objective.of_model(calibration.model, problem.trajectories)
     inside = bool(problem.inside(vector[None])[0])
     shrinking = None
-    weighed = provenance is not None and (provenance.unidentified == "shrink" or provenance.calibrator == "map")
+    weighed = provenance is not None and provenance.unidentified in ("shrink", "weigh")
     if calibration.effects or weighed:
         optimum = run_calibrator(calibrators.create(settings.calibrator), problem)
         if optimum.vector is None or optimum.cost is None:

@@ -24,7 +24,7 @@ from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.settings import Budget as Budget
 from omnibench.fit.settings import CompleteSettings
-from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span, unidentified_directions
+from omnibench.fit.span import DrivenSpan, Treatment, directions_kept, driven_span, unidentified_directions
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
@@ -174,7 +174,7 @@ class CalibrationProblem(SearchBox):
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
     trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
-    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does (fit/loss.py).
+    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
     start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
     values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
@@ -443,6 +443,7 @@ def make_problem(
         integration=settings.integration,
         budget=settings.budget,
         seed=settings.seed,
+        tolerance=settings.tolerance,
         span=span,
         watch=watch,
     )
@@ -455,14 +456,15 @@ def make_parameterisation(
     *,
     box: Box = "row",
     limits: GeometryLimits | None = None,
-    unidentified: Unidentified = "keep",
+    unidentified: Treatment = "keep",
     mount: MountChoice | None = None,
     span: DrivenSpan | None = None,
 ) -> Parameterisation:
     """The parameterisation called ``name``. ConfigError when its box excludes the start.
 
     unidentified: for directions of wheel rates that the trajectories drive so little that slip alone may explain it,
-    ``keep`` holds the matrix at the design values along them, ``fit`` fits it. The geometry always fits
+    ``keep`` holds the matrix at the design values along them, ``fit`` fits it, and ``weigh`` leaves what to do there,
+    and about combinations that references leave open, to the calibrator. The geometry always fits
     them: it cannot hold values along a direction. mount: whether the tracked point of a robot that cannot slide is
     where the robot says, or fitted; default: see ``default_mount``. span: what
     the trajectories drive; default: computed here.
@@ -472,7 +474,7 @@ def make_parameterisation(
         return WheelGeometry(robot, limits, mount == "fit")
     null = directions_kept(robot, span or driven_span(trajectories), unidentified)
     searched = MatrixElements(robot, box, null, mount == "known")
-    return with_open_combinations(searched, trajectories)
+    return searched if unidentified == "weigh" else with_open_combinations(searched, trajectories)
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.prior import MountChoice
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Treatment, Unidentified
 from omnibench.robot.odometry import Integration
 
 SteeringChoice = Literal["known", "fit"]
@@ -94,7 +94,7 @@ class CompleteSettings(FitSettings):
     calibrator: str
     cost: CostChoice
     parameterisation: ParameterisationName
-    unidentified: Unidentified
+    unidentified: Treatment  # type: ignore[assignment]
 
     @property
     def objective(self) -> str:

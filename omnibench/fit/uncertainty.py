@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
+from omnibench.fit.cost import Cost
 from omnibench.fit.jackknife import Clusters, depending, jackknife
 from omnibench.fit.loss import RobustCost, loss_of, norms_of
 from omnibench.fit.noise import GIVEN, roots_of
@@ -173,15 +174,23 @@ def runs_without_heading(problem: CalibrationProblem) -> list[str]:
 
 def _of_runs(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Slopes (Z, n) and Hessians (Z, n, n) of the runs' parts of the cost by the free numbers, Eq. (1)."""
-    objective, odometry = problem.objective, problem.odometry
+    odometry, matrix = problem.odometry, problem.matrix(vector)
+    columns = problem.parameterisation.slopes(vector)[:, free]
+    errors = odometry.poses(matrix[None])[0] - problem.reference
+    slopes = odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ columns
+    return sum_of_norms(problem.objective, odometry.trajectory, errors, slopes)
+
+
+def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: Array) -> tuple[Array, Array]:
+    """Slopes (Z, n) and Hessians (Z, n, n) of the runs' parts of a cost that is a sum of norms, Eq. (1).
+
+    run (S,): of each row of errors (S, 3), m and rad, with the derivatives slopes (S, 3, n).
+    """
     base = norms_of(objective)
     assert base is not None  # _by_scatter has checked
-    matrix, count = problem.matrix(vector), len(problem.trajectories)
-    columns = problem.parameterisation.slopes(vector)[:, free]
-    factors = np.array(base.weights)
-    errors = (odometry.poses(matrix[None])[0] - problem.reference) * factors
-    slopes = (odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ columns) * factors[:, None]
-    shares, norms = base.shares(odometry.trajectory), np.linalg.norm(errors, axis=1)
+    factors, count = np.array(base.weights), int(run.max()) + 1
+    errors, slopes = errors * factors, slopes * factors[:, None]
+    shares, norms = base.shares(run), np.linalg.norm(errors, axis=1)
     if isinstance(objective, RobustCost):
         ratios = norms / objective.loss.scales(norms[None], shares)[0]
         weights, bent = objective.loss.weights(ratios), objective.loss.slopes(ratios)
@@ -205,9 +214,9 @@ def _of_runs(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_]
     along = np.einsum("sci,sc->si", slopes, units)
     by_row = (shares * weights)[:, None, None] * np.einsum("sci,scj->sij", slopes, slopes)
     by_row += (shares * bent)[:, None, None] * along[:, :, None] * along[:, None, :]
-    slope, hessian = np.zeros((count, len(columns.T))), np.zeros((count, *by_row.shape[1:]))
-    np.add.at(slope, odometry.trajectory, (shares * weights * norms)[:, None] * along)
-    np.add.at(hessian, odometry.trajectory, by_row)
+    slope, hessian = np.zeros((count, slopes.shape[2])), np.zeros((count, *by_row.shape[1:]))
+    np.add.at(slope, run, (shares * weights * norms)[:, None] * along)
+    np.add.at(hessian, run, by_row)
     return slope, hessian
 
 
@@ -254,11 +263,10 @@ def physical_parameters(
         covariance = np.array(result.extension.covariance)
         freedom = max(len(Clusters.of(problem.trajectories).members) - 1, 1)
     held = problem.without_interval(result.at_bounds)
-    unknown = [
-        np.kron(np.eye(3), problem.unidentified),
-        problem.parameterisation.slopes(result.vector)[:, held].T,
-    ]
-    if problem.left_open is not None:
+    unknown = [problem.parameterisation.slopes(result.vector)[:, held].T]
+    if uncertainty is None or uncertainty.basis != "posterior":  # which the design tells, too
+        unknown.append(np.kron(np.eye(3), problem.unidentified))
+    if problem.left_open is not None and (uncertainty is None or uncertainty.basis != "posterior"):
         unknown.append(problem.left_open * np.repeat(problem.robot.row_scales, result.matrix.shape[1]))
     return read_matrix(
         problem.robot,

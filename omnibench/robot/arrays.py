@@ -1,14 +1,18 @@
-"""Types of arrays of floats, and arrays of what a user gives."""
+"""Types of arrays of floats, and arrays and tables of what a user gives."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import PlainSerializer, PlainValidator
 
 from omnibench.errors import DataError
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Array = NDArray[np.floating[Any]]
 
@@ -36,3 +40,24 @@ def finite_array(name: str, values: ArrayLike, dimensions: int) -> Array:
     for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
         raise DataError(f"{name}, row {row + 1}: it holds a value that is missing or infinite")
     return array
+
+
+def frame_of(name: str, content: Any) -> pl.DataFrame:
+    """A data frame or a dict of columns as a Polars frame. DataError names the table and the column that is unfit."""
+    import polars as pl  # takes longer than all that imports this module
+
+    if isinstance(content, pl.DataFrame):
+        return content
+    names = content if isinstance(content, Mapping) else getattr(content, "columns", None)  # as pandas has them
+    if names is None:
+        raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
+    arrays = {str(column): np.atleast_1d(np.asarray(content[column])) for column in names}
+    for column, array in arrays.items():
+        first = next(iter(arrays))
+        if array.ndim != 1:
+            raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
+        if len(array) != len(arrays[first]):
+            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {len(arrays[first])}")
+    return pl.DataFrame(
+        {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -29,7 +30,8 @@ from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.robot.physical import PhysicalParameter, read_matrix
-from omnibench.views import Shown
+from omnibench.robot.wheel_logs import logs_of
+from omnibench.views import Shown, as_pandas
 from omnibench.words import plural
 
 FORMAT: Final = "omnibench-calibration/1"
@@ -155,8 +157,8 @@ class Provenance(config.Model):
         None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=_is_none
     )
     box: str
-    unidentified: Literal["keep", "fit", "shrink"] = Field("keep", description="what the data hardly tell")
-    tolerance: float | None = Field(None, description="of the design, for shrink; None: that of the robot's class")
+    unidentified: Literal["keep", "fit", "shrink", "weigh"] = Field("keep", description="what the data hardly tell")
+    tolerance: float | None = Field(None, description="of the design, for map; None: that of the robot's class")
     mount: Literal["known", "fit"] | None = Field(None, description="tracked point of a robot that cannot slide")
     unshrunk_cost: float | None = Field(None, description="training cost before it was shrunk to the design")
     on_bounds: tuple[str, ...] = Field((), description="fitted numbers on a bound of the box")
@@ -359,6 +361,31 @@ class Calibration(Shown, config.Model):
         if name not in named:
             raise DataError(f"robot {self.robot.name} has no {name}; it has {', '.join(named)}")
         return named[name].value
+
+    def predict(self, wheels: Any, *, start: ArrayLike | None = None) -> Any:
+        """Poses by the calibration's odometry: a data frame with t (s), x, y (m) and theta (rad, not wrapped).
+
+        wheels: a run of a data set; or a data frame (Polars, pandas) or a dict of columns: t, the ends of the wheel
+        samples (s), omega_<wheel> of every measured wheel (rad/s), steer_<wheel> of steered ones (rad), phi_<wheel>
+        where an effect needs them. A table with a column ``trajectory`` is of several runs, and so is the answer, which
+        has a row at t = 0 and one for each sample, and is a pandas frame for a pandas frame. start: pose at t = 0;
+        default: a run's own, else the origin.
+
+        DataError: a column is missing, or a value is wrong.
+
+        >>> wheels = {f"omega_{name}": [1.0, 1.0] for name in calibration.robot.wheel_names}
+        >>> calibration.predict({"t": [0.5, 1.0], **wheels}).shape
+        (3, 4)
+        """
+        import polars as pl  # takes longer than all that imports this module
+
+        model, frames = self.model, []
+        for name, log in logs_of(self.robot, wheels, start):
+            x, y, theta = model.poses([log])[0].T
+            poses = pl.DataFrame({"t": log.stamps, "x": x, "y": y, "theta": theta})
+            frames.append(poses if name is None else poses.select(pl.lit(name).alias("trajectory"), pl.all()))
+        predicted = pl.concat(frames)
+        return as_pandas(predicted) if type(wheels).__module__.startswith("pandas") else predicted
 
     @property
     def effects_in_words(self) -> str:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import get_args
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from omnibench.errors import DataError, require_choice, require_type
-from omnibench.robot.arrays import finite_array
+from omnibench.errors import require_choice, require_type
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.kinematics import Wheel as Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, WheelLog
+from omnibench.robot.odometry import Integration
+from omnibench.robot.wheel_logs import log_of_arrays
 
 
 def odometry(
@@ -48,14 +47,6 @@ def odometry(
     >>> poses.shape, bool(np.allclose(poses[-1], [0.4, 0, 0]))
     ((100, 3), True)
     """
-    log = WheelLog(
-        times=finite_array("times", times, 1),
-        rates=finite_array("rates", rates, 2),
-        start=finite_array("start", start, 1),
-        stamps=finite_array("stamps", times if stamps is None else stamps, 1),
-        wheel_angles=None if angles is None else finite_array("angles", angles, 2),
-        steering=None if steering is None else finite_array("steering", steering, 2),
-    )
     if integration is not None:
         require_choice("integration", integration, get_args(Integration))
     if isinstance(robot, Robot):
@@ -64,30 +55,5 @@ def odometry(
         require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
         model = robot.model
         model = replace(model, integration=integration or model.integration)
-    _check(model.robot, log)
-    if not model.robot.drive.direct:
-        log = replace(log, drive=model.robot.drive)
+    log = log_of_arrays(model.robot, times, rates, start=start, stamps=stamps, steering=steering, angles=angles)
     return model.poses([log])[0]
-
-
-def _check(robot: Robot, log: WheelLog) -> None:
-    """DataError: shapes do not agree with each other and the robot, or times do not increase."""
-    steered = robot.drive.steered
-    if steered and log.steering is None:
-        raise DataError(f"steering is missing: angles (F, {len(steered)}) of the wheels {', '.join(steered)}, rad")
-    samples = len(log.times)
-    rows = "a row for each of the times, a column for each of the wheels"
-    of_wheels, of_steered = f"{rows} {', '.join(robot.wheel_names)}", f"{rows} {', '.join(steered)}"
-    for name, array, shape, axes in (
-        ("rates", log.rates, (samples, len(robot.wheel_names)), of_wheels),
-        ("angles", log.wheel_angles, (samples, len(robot.wheel_names)), of_wheels),
-        ("steering", log.steering, (samples, len(steered)), of_steered),
-        ("start", log.start, (3,), "x, y in m and heading in rad"),
-    ):
-        if array is not None and array.shape != shape:
-            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {axes}")
-    for name, values, least in (("times", log.times, np.nextafter(0.0, 1.0)), ("stamps", log.stamps, 0.0)):
-        steps = np.diff(values, prepend=values[0] - 1.0)
-        for row in np.flatnonzero((steps <= 0) | (values < least))[:1]:
-            rule = "> 0" if name == "times" else ">= 0"
-            raise DataError(f"{name}, row {row + 1}: it is {values[row]:g}; times increase and are {rule}")

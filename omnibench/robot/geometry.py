@@ -87,9 +87,10 @@ class Geometry:
     def numbers(self) -> tuple[Number, ...]:
         """The numbers at their design values; the pose of the tracked point stands last."""
         robot, mount = self.robot, self.robot.mount or kinematics.Mount()
+        reach = robot.reach or 1.0  # 0 for one wheel at the centre
         tracked = (
-            Number("mount_x", "", mount.x, robot.reach),
-            Number("mount_y", "", mount.y, robot.reach),
+            Number("mount_x", "", mount.x, reach),
+            Number("mount_y", "", mount.y, reach),
             Number("mount_yaw", "", mount.yaw, 1.0),
         )
         if isinstance(robot.drive, CarDrive):
@@ -100,10 +101,10 @@ class Geometry:
         steered = [wheel for wheel in robot.measured if wheel.has_steering]
         return (
             *(Number("radius", wheel.name, wheel.radius, wheel.radius) for wheel in robot.measured),
-            *(Number("distance", wheel.name, wheel.lever, abs(wheel.lever) or robot.reach) for wheel in plain),
+            *(Number("distance", wheel.name, wheel.lever, abs(wheel.lever) or reach) for wheel in plain),
             *(Number("angle", wheel.name, wheel.axle, 1.0) for wheel in plain if wheel.kind != "fixed"),
-            *(Number("x", wheel.name, wheel.position[0], wheel.reach) for wheel in steered),
-            *(Number("y", wheel.name, wheel.position[1], wheel.reach) for wheel in steered),
+            *(Number("x", wheel.name, wheel.position[0], wheel.reach or reach) for wheel in steered),
+            *(Number("y", wheel.name, wheel.position[1], wheel.reach or reach) for wheel in steered),
             *(Number("offset", wheel.name, 0.0, 1.0) for wheel in steered),
             *tracked,
         )

@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from pydantic import FiniteFloat
@@ -36,15 +36,13 @@ from omnibench.errors import DataError
 from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, Geometry, physical_tolerance
 from omnibench.robot.kinematics import Array, CarDrive, Robot, relative_deviations
 
-if TYPE_CHECKING:
-    from omnibench.robot.calibration import EffectTerm
-
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
 MANY = 1e9
 
 _RANK = 1e-6  # share of the strongest change of z: less is rounding, and the matrix does not show it
 _UNSEEN = 1e-3  # share of a parameter's variance by tolerance: from it on it depends on what the data do not tell
+_SHOWN = 0.1  # share of an unknown change that shows in motions: one of less is of wheels that only slip; chosen
 _NO_VARIANCE = 1e-9  # share of a parameter's deviation by tolerance: less is rounding
 _RESTING, _MOST_STEPS = 1e-8, 50  # of y, in deviations of the tolerance
 _FARTHEST = 1e3  # the same, of numbers that no robot has
@@ -87,6 +85,15 @@ class EstimatedCovariance:
 
 
 Unit = Literal["m", "rad", "rad/s", "1"]
+
+
+class NamedEffect(Protocol):
+    """An effect by its name, with the values of its parameters, as a calibration file holds it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def parameters(self) -> Mapping[str, float]: ...
 
 
 class PhysicalParameter(Model):
@@ -139,7 +146,7 @@ def read_matrix(
     matrix: Array,
     covariance: Array | None = None,
     degrees_of_freedom: Array | float = np.inf,
-    effects: Sequence[EffectTerm] = (),
+    effects: Sequence[NamedEffect] = (),
     *,
     fitted_mount: bool = False,
     unknown: Array | None = None,
@@ -190,8 +197,9 @@ def read_matrix(
         untold = scattering.standard_deviations <= _NO_VARIANCE * model.deviations(np.eye(len(model.spread.T)))
         untold |= by_effects.any(axis=1) & (known == size)
         if unknown is not None and len(unknown):
-            lost, strengths, _ = np.linalg.svd(seen @ unknown.T, full_matrices=False)
-            lost = lost[:, strengths > _RANK * strengths[0]]
+            sizes = np.linalg.norm(unknown / units, axis=1)
+            lost, strengths, _ = np.linalg.svd(seen @ unknown.T / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+            lost = lost[:, strengths > _SHOWN]
             _, unseen = _split(at_design - lost @ lost.T @ at_design)
             more = model.deviations(unseen) ** 2 - model.deviations(hidden) ** 2
             untold |= more > _UNSEEN * model.deviations(np.eye(len(model.spread.T))) ** 2
@@ -304,30 +312,40 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
         changes: Mapping[str, float] = {"radius": deviation / len(robot.measured)} if car else {name: deviation}
         columns.append((changes, {name: deviation}))
 
-    # Track and wheelbase: wheels stand farther from the middle between them, or from the axle of fixed wheels.
-    fixed = {f"distance_{wheel.name}": wheel.lever for wheel in robot.measured if wheel.kind == "fixed" and not car}
-    along, across = ({f"{axis}_{wheel.name}": wheel.position[i] for wheel in steered} for i, axis in enumerate("xy"))
-    stretched: list[tuple[str, Mapping[str, float], float, float]] = []
-    if car:
-        wheelbase = at_design["wheelbase"]
-        stretched.append(("wheelbase", {"wheelbase": wheelbase}, 0.0, abs(wheelbase)))
+    # Track and wheelbase: changes of numbers where wheels stand farther from the middle between them, or from the axle.
+    stretched: list[tuple[str, Mapping[str, float], float]] = []
+    fixed = [wheel for wheel in robot.measured if wheel.kind == "fixed" and not car]
     if fixed:
-        stretched.append(("track", fixed, *_middle(fixed)))
-    if steered and not robot.slides:
+        sides = [math.copysign(1.0, math.cos(wheel.rolling - fixed[0].rolling)) for wheel in fixed]
+        places = [side * wheel.lever for side, wheel in zip(sides, fixed, strict=True)]
+        middle, length = _middle(places)
+        changes = {
+            f"distance_{wheel.name}": side * (place - middle)
+            for wheel, side, place in zip(fixed, sides, places, strict=True)
+        }
+        stretched.append(("track", changes, length))
+    if car:
+        stretched.append(("wheelbase", {"wheelbase": at_design["wheelbase"]}, abs(at_design["wheelbase"])))
+    elif steered and not robot.slides:
         _, turning = robot.motions
         axle = -float(turning[1] / turning[2])
-        stretched.append(("wheelbase", along, axle, float(np.mean([abs(x - axle) for x in along.values()]))))
+        ahead = {f"x_{wheel.name}": wheel.position[0] - axle for wheel in steered}
+        stretched.append(("wheelbase", ahead, float(np.mean(np.abs(list(ahead.values()))))))
     elif steered:
-        stretched += [] if fixed else [("track", across, *_middle(across))]
-        stretched.append(("wheelbase", along, *_middle(along)))
-        columns += [({number: tolerance.elements * robot.reach}, {}) for number in (*along, *across)]
-    for name, numbers, origin, length in stretched:
+        for name, axis in (("track", 1), ("wheelbase", 0)):
+            places = [wheel.position[axis] for wheel in steered]
+            middle, length = _middle(places)
+            numbers = [f"{'xy'[axis]}_{wheel.name}" for wheel in steered]
+            if name == "wheelbase" or not fixed:
+                stretched.append(
+                    (name, {each: place - middle for each, place in zip(numbers, places, strict=True)}, length)
+                )
+            columns += [({number: tolerance.elements * robot.reach}, {}) for number in numbers]
+    share = tolerance.rows[2]  # as turning is off
+    for name, changes, length in stretched:
         if length > _NO_LENGTH:
             design[name] = length
-            share = tolerance.rows[2]  # as turning is off
-            columns.append(
-                ({each: share * (value - origin) for each, value in numbers.items()}, {name: share * length})
-            )
+            columns.append(({number: share * change for number, change in changes.items()}, {name: share * length}))
 
     # Distances and angles of wheels on rollers.
     on_rollers = [wheel for wheel in robot.measured if wheel.kind in ("omni", "mecanum")]
@@ -367,13 +385,12 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
     return _ClassModel(geometry, spread, design, reported)
 
 
-def _middle(values: Mapping[str, float]) -> tuple[float, float]:
-    """The middle between the least and the largest value, and the distance between them."""
-    low, high = min(values.values()), max(values.values())
-    return (low + high) / 2, high - low
+def _middle(places: Sequence[float]) -> tuple[float, float]:
+    """The middle between the least and the largest place, and the distance between them."""
+    return (min(places) + max(places)) / 2, max(places) - min(places)
 
 
-def _factors_of_effects(robot: Robot, effects: Sequence[EffectTerm]) -> list[Mapping[str, float]]:
+def _factors_of_effects(robot: Robot, effects: Sequence[NamedEffect]) -> list[Mapping[str, float]]:
     """By how much each parameter of the effects changes the physical parameters of a robot, by their names."""
     every = robot.drive.steered
     known = {

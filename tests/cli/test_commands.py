@@ -109,6 +109,10 @@ def test_a_calibration_of_an_older_version_says_what_its_regions_lack(
 def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     found = document(command("calibrate", prepared.data, "--json", "-o", tmp_path / "c.yaml"))
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
+    assert list(found["parameters"]) == [
+        f"{kind}_{wheel}" for kind in ("radius", "distance", "angle") for wheel in "abc"
+    ]
+    assert list(found["parameters"]["radius_a"]) == ["design", "value", "unit", "low", "high"]
     assert found["format"] == "omnibench-calibration/1"
     assert np.shape(found["matrix"]) == (3, 3)
 

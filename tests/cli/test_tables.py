@@ -5,6 +5,7 @@ import pty
 import re
 import subprocess
 from contextlib import suppress
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, Command, compared_here, search, succeeded, write_config
 from report_page import Page, on_terminal
 from rich.console import Console
-from sample_robots import TRICYCLE
+from sample_robots import APR_02, DIFFERENTIAL, TRICYCLE, WHEELED
 from syrupy.assertion import SnapshotAssertion
 from timing import PATIENCE
+from wheeled_recordings import PERIOD as RECORDED
+from wheeled_recordings import recorded
 from wheeled_samples import driven
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
@@ -201,6 +204,40 @@ def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
     assert any(line.split() == ["matrix", "front_cos", "front_sin"] for line in lines)
     assert any(line.startswith("directions of drive signals driven: 2 of 2") for line in lines)
     assert not any("wheel front" in line for line in lines)
+
+
+@pytest.mark.parametrize("robot", [APR_02, *WHEELED], ids=lambda robot: robot.name)
+def test_a_calibration_shows_physical_parameters_then_the_matrix_on_a_screen_of_80_columns(robot: Robot) -> None:
+    runs = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), "posterior", mount="fit")
+    lines = on_terminal(print_calibration, run, ["file", "verdict", "next", "COMMAND"], width=80).splitlines()
+    assert len(lines) <= 25 - 4
+    names = [each.name for each in run.parameters]
+    assert [line.split()[0] for line in lines if line.split()[0] in names] == names
+    first = next(number for number, line in enumerate(lines) if line.startswith("matrix"))
+    assert first > max(number for number, line in enumerate(lines) if line.split()[0] in names)
+    assert max(len(line) for line in lines if "steps" not in line) <= 80
+    shown = " ".join(" ".join(lines[first:]).split())
+    elements = [f"{value:+.7f}" for value in run.calibration.matrix_array.ravel()]
+    assert all(each in shown for each in elements) or lines[first].startswith("matrix (3 x 8): not on this screen")
+
+
+def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> None:
+    runs = recorded(DIFFERENTIAL, 1.02 * DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
+    row = next(line for line in on_terminal(print_calibration, run).splitlines() if line.startswith("radius_left"))
+    (radius,) = (each for each in run.parameters if each.name == "radius_left")
+    interval = f"{radius.low:.5f} to {radius.high:.5f}"
+    assert (
+        " ".join(row.split())
+        == f"radius_left 0.05000 {radius.value:.5f} m {radius.deviation_percent:+.2f} % {interval}"
+    )
+
+
+def test_without_a_reading_the_matrix_is_shown_alone() -> None:
+    runs = recorded(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = replace(calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs)), parameters=())
+    assert on_terminal(print_calibration, run).startswith("diff closed_form\nmatrix ")
 
 
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:

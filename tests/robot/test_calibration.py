@@ -11,7 +11,7 @@ import pytest
 import yaml
 from commands import refused
 from effect_samples import a_drive
-from export_samples import TRICYCLE, calibration
+from export_samples import DIFF, TRICYCLE, calibration
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_robots import APR_02
@@ -29,7 +29,8 @@ from omnibench.robot.calibration import (
     read_calibration,
     write_calibration,
 )
-from omnibench.robot.kinematics import published_matrix
+from omnibench.robot.kinematics import Mount, published_matrix
+from omnibench.robot.physical import read_matrix
 
 PROVENANCE = Provenance(
     dataset="flower",
@@ -258,3 +259,69 @@ def test_a_calibration_whose_effects_cannot_be_run_says_so_by_its_name() -> None
     chosen = a_calibration().model_copy(update={"effects": (EffectTerm(name="heading_drift", parameters={"k": 0.1}),)})
     with pytest.raises(OmnibenchError, match="calibration 'flower closed_form': effect 'heading_drift'"):
         _ = chosen.model
+
+
+# Physical parameters.
+
+
+def test_parameters_stand_in_the_file_by_their_names_with_design_value_unit_and_interval(tmp_path: Path) -> None:
+    named = {each.name: each for each in read_matrix(APR_02, APR_MATRIX, 1e-8 * np.eye(9), 5).parameters}
+    write_calibration(a_calibration(parameters=named), tmp_path / "calibration.yaml")
+    content = yaml.safe_load((tmp_path / "calibration.yaml").read_text())["parameters"]
+    assert list(content) == [f"{kind}_{wheel}" for kind in ("radius", "distance", "angle") for wheel in "abc"]
+    assert list(content["radius_a"]) == ["design", "value", "unit", "low", "high"]
+    assert content["radius_a"]["low"] < content["radius_a"]["value"] < content["radius_a"]["high"]
+    found = read_calibration(tmp_path / "calibration.yaml")
+    assert found.parameters == named
+    assert found.radius["a"] == named["radius_a"].value
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda content: content.update(unit="inch"), "unit"),
+        (lambda content: content.update(value=float("nan")), "value"),
+        (lambda content: content.update(sigma=0.1), "sigma"),
+    ],
+)
+def test_a_parameter_that_is_none_is_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    parameter = {"design": 0.1, "value": 0.1, "unit": "m", "low": None, "high": None}
+    change(parameter)
+    file = broken(tmp_path, lambda content: content.update(parameters={"radius_a": parameter}))
+    with pytest.raises(DataError, match=rf"parameters\.radius_a.*{words}"):
+        read_calibration(file)
+
+
+def test_a_file_without_parameters_has_them_by_its_matrix() -> None:
+    old = a_calibration()
+    assert old.parameters is None
+    assert old.radius == pytest.approx({"a": 0.152968, "b": 0.153333, "c": 0.152941}, abs=1e-6)
+    assert old.distance == pytest.approx({"a": 0.209806, "b": 0.223457, "c": 0.217368}, abs=1e-6)
+    assert old.angle == pytest.approx({"a": 1.057446, "b": 3.149809, "c": 5.234812}, abs=1e-6)
+    assert old.mount == Mount()
+    fitted = a_calibration(provenance=PROVENANCE.model_copy(update={"mount": "fit"}))
+    assert math.hypot(fitted.mount.x, fitted.mount.y) == pytest.approx(0.0078, abs=1e-4)
+
+
+def test_the_numbers_of_two_wheels_and_of_a_tricycle_are_attributes() -> None:
+    two = calibration(DIFF)
+    assert two.track == pytest.approx(values_of(two)["track"])
+    assert two.radius.keys() == {"left", "right"}
+    assert two.mount.y == pytest.approx(values_of(two).get("mount_y", 0.0))
+    assert calibration(TRICYCLE).wheelbase == pytest.approx(values_of(calibration(TRICYCLE))["wheelbase"])
+
+
+def values_of(shown: Calibration) -> dict[str, float]:
+    return {name: each.value for name, each in shown.physical_parameters.items()}
+
+
+@pytest.mark.parametrize(("name", "words"), [("track", "track"), ("wheelbase", "wheelbase")])
+def test_what_a_robot_does_not_have_is_said(name: str, words: str) -> None:
+    with pytest.raises(DataError, match=f"robot APR-02 has no {words}; it has radius_a, radius_b"):
+        getattr(a_calibration(), name)
+    with pytest.raises(DataError, match="robot diff has no distance; it has radius_right, radius_left, track"):
+        _ = calibration(DIFF).distance
+    with pytest.raises(DataError, match="no reading in physical parameters"):
+        _ = a_calibration(matrix=matrix_rows(np.ones((3, 3)))).radius

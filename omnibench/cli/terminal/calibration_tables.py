@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
+from rich.console import Console, RenderableType
 
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table, render_table
@@ -19,6 +20,7 @@ from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.path_errors import PathError
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.calibration_report import parameter_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
@@ -28,7 +30,7 @@ from omnibench.words import plural
 
 _NONE = "no interval"
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
-_ENDING = 4  # lines of ``calibrate`` after the tables: file, verdict, and what to do next
+_ROWS = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
 _COLUMNS = 3  # columns with an interval each that 80 columns of a terminal hold
 _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is rounding
@@ -67,10 +69,10 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     )
 
 
-def print_calibration(console: Console, run: CalibrationRun, others: int = _ENDING) -> bool:
+def print_calibration(console: Console, run: CalibrationRun, others: Sequence[str] = (), last: str = "") -> bool:
     """Print the physical parameters, then the matrix, then what the intervals rest on, as far as a screen holds it.
 
-    others: lines that the command prints as well. Returns whether there is room for one more.
+    others: what the command prints as well. Returns whether there is room for the line ``last``, too.
     """
     lines = [f"{run.result.outcome}: {run.result.reason}; {plural(run.result.evaluations, 'evaluation')}"]
     lines[0] += f", {run.result.seconds:.2f} s"
@@ -78,42 +80,47 @@ def print_calibration(console: Console, run: CalibrationRun, others: int = _ENDI
         lines.insert(0, f"95 % intervals: {run.uncertainty.source}")
         if run.calibration.noise is not None:
             lines.append(f"noise of the reference: {'; '.join(noise_in_words(run.calibration.noise))}")
-    heights = [-(-len(line) // console.width) if console.is_terminal else 1 for line in lines]
+    room = _SCREEN - _height(console, *others)
+    if run.parameters:
+        parameters = render_table(parameter_table(run.calibration, _title(run)), console.width)
+        console.print(parameters)
+        room -= _height(console, parameters)
 
-    tables = [_parameter_table(run)] if run.parameters else []
-    room = _SCREEN - others - sum(_height(console, table) for table in tables)
-    wide, narrow = _matrix_table(run, intervals=True), _matrix_table(run, intervals=False)
-    chosen = wide if _height(console, wide) + sum(heights) <= room else narrow
-    room -= _height(console, chosen)
-    for table in (*tables, chosen):
-        print_table(console, table)
-    for line, height in zip(lines, heights, strict=True):
-        if height <= room:
+    # The matrix with its intervals, if all else has room then; without; its elements alone; or where it is.
+    forms: list[RenderableType] = [
+        render_table(_matrix_table(run, intervals=intervals), console.width) for intervals in (True, False)
+    ]
+    elements = list(_elements(run.calibration))
+    if max(map(len, elements)) <= console.width:
+        forms.append("\n".join(elements))
+    forms.append(f"matrix (3 x {len(run.calibration.matrix[0])}): not on this screen; --json shows it, -o writes it")
+    heights = [_height(console, forms[0], *lines), *(_height(console, form) for form in forms[1:])]
+    fitting = [form for form, height in zip(forms, heights, strict=True) if height <= room]
+    matrix = next(iter(fitting), forms[-1])
+    console.print(matrix, soft_wrap=isinstance(matrix, str))
+    room -= _height(console, matrix)
+    for line in lines:
+        if _height(console, line) <= room:
             console.print(line, soft_wrap=True)
-            room -= height
-    return room > 0
+            room -= _height(console, line)
+    return _height(console, last) <= room
 
 
-def _height(console: Console, table: Table) -> int:
-    """Lines of a table on a console."""
-    return len(console.render_lines(render_table(table, console.width)))
+def _elements(calibration: Calibration) -> Iterator[str]:
+    """The elements of a matrix in four lines."""
+    names = calibration.robot.drive.names
+    width = max(11, *(len(name) + 1 for name in names))
+    yield f"{'matrix':12}{''.join(f'{name:>{width}}' for name in names)}"
+    for label, row in zip(_ROWS, calibration.matrix, strict=True):
+        yield f"{label:12}{''.join(f'{value:+{width}.7f}' for value in row)}"
 
 
-def _parameter_table(run: CalibrationRun) -> Table:
-    """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
-    rows = []
-    for each in run.parameters:
-        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
-            each.unit, (1.0, 5, each.unit)
-        )
-        percent = None if each.unit == "rad" else each.deviation_percent
-        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if percent is None else f"{percent:+.2f} %"
-        ends = [] if each.low is None or each.high is None else [each.low, each.high]
-        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or _NONE
-        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append(Row.of(each.name, *values, unit, change, interval))
-    headings = (Column("design"), Column("value"), Column("", numeric=False), Column("change"), Column("95 %"))
-    return Table(_title(run), (Column("parameter", numeric=False), *headings), tuple(rows))
+def _height(console: Console, *shown: RenderableType) -> int:
+    """The lines that this takes on a console, in a pipe that does not wrap texts."""
+    texts = [each.splitlines() for each in shown if isinstance(each, str)]
+    tables = [len(console.render_lines(each)) for each in shown if not isinstance(each, str)]
+    width = console.width if console.is_terminal else sys.maxsize
+    return sum(tables) + sum(-(-max(len(line), 1) // width) for text in texts for line in text)
 
 
 def _title(run: CalibrationRun) -> str:
@@ -127,7 +134,6 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
     It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
     """
     calibration = run.calibration
-    labels = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
     touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
     marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
     notes, listed = [], list[tuple[str, ElementIntervals]]()
@@ -153,7 +159,7 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
         for name, ends in ((name, zip(each.low, each.high, strict=True)) for name, each in listed)
     ]
     turned = len(signals) > _COLUMNS
-    headings, lines = (labels, signals) if turned else (signals, labels)
+    headings, lines = (_ROWS, signals) if turned else (signals, _ROWS)
     rows = []
     for number, label in enumerate(lines):
         rows.append(Row.of(label, *(values.T if turned else values)[number]))

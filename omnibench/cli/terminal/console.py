@@ -80,7 +80,8 @@ def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable
     sessions: sentences on sessions that differ from the others or could not be compared.
     """
     for sentence in (f"{subject}{verdict.sentence}", verdict.detail, *sessions):
-        say(sentence)
+        if sentence:
+            say(sentence)
 
 
 def print_ending(outcome: str, then: str = "", *command: object) -> None:
