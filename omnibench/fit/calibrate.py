@@ -17,6 +17,7 @@ from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.open_combinations import open_sentences
+from omnibench.fit.path_errors import slip_of
 from omnibench.fit.prior import default_cost, default_mount, physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
@@ -231,7 +232,7 @@ def _calibration(
         "reason": result.reason,
         "held_out": verdict_on(model, training, validation),
     }
-    return calibration_of_fit(
+    calibration = calibration_of_fit(
         f"{dataset.name} {settings.calibrator}",
         dataset,
         result.matrix,
@@ -241,6 +242,7 @@ def _calibration(
         parameters={each.name: each for each in reading.parameters},
         **dict(extension) | {"covariance": extension.covariance or covariance},
     )
+    return calibration.model_copy(update={"slip": slip_of(calibration, training)})
 
 
 def _warnings(

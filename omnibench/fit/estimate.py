@@ -234,7 +234,7 @@ def estimate(
     root[: matrix.size, : problem.root.shape[1]] = problem.root
     for number, unknown in enumerate(problem.unknowns):
         root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
-    information = information - rows.bent(errors, slopes, weights, excess, loss)
+    information = rows.curvature(errors, slopes, drifts, weights, excess, loss)
     kinds = dict(zip(rows.kinds, excess.tolist(), strict=True))
     return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps - first, at_rest)
 
@@ -408,15 +408,24 @@ class _Rows:
             information = information - np.swapaxes(along, 1, 2) @ np.linalg.solve(inner, along)
         return information, scores
 
-    def bent(self, errors: Array, slopes: Array, weights: Array, excess: Array, loss: Loss) -> Array:
-        """What curvature (Z, k, k) the runs lack where the loss is no parabola: x h'(x) along each row's error."""
+    def curvature(
+        self, errors: Array, slopes: Array, drifts: Array, weights: Array, excess: Array, loss: Loss
+    ) -> Array:
+        """Hessians (Z, k, k) of half of the runs' parts of Eq. (3), nuisances eliminated.
+
+        A row lacks x h'(x) of its weight along its error, where the loss is no parabola: of itself and of nuisances.
+        """
         ratios = np.sqrt(np.nansum(np.square(errors) / self.variances(excess), axis=1))
-        lost = -loss.slopes(ratios) / loss.weights(np.zeros(1))
-        scaled = errors * np.sqrt(self.precisions(excess))
+        lost = np.clip(-loss.slopes(ratios) / loss.weights(np.zeros(1)), 0.0, weights)
+        roots = np.sqrt(self.precisions(excess))
+        scaled = errors * roots
         units = scaled / np.maximum(np.linalg.norm(scaled, axis=1), np.finfo(float).tiny)[:, None]
-        along = np.einsum("sci,sc->si", slopes * np.sqrt(self.precisions(excess))[..., None], units)
-        assert weights.shape == lost.shape
-        return self._by_run(lost[:, None, None] * along[:, :, None] * along[:, None, :])
+        whole, count = np.concatenate([slopes, drifts], axis=2) * roots[..., None], slopes.shape[2]
+        along = np.einsum("sci,sc->si", whole, units) * np.sqrt(lost)[:, None]
+        weighted = np.einsum("sci,scj->sij", whole * weights[:, None, None], whole)
+        sums = self._by_run(weighted - along[:, :, None] * along[:, None, :])
+        inner, beside = sums[:, count:, count:] + np.eye(drifts.shape[2]), sums[:, count:, :count]
+        return sums[:, :count, :count] - np.swapaxes(beside, 1, 2) @ np.linalg.solve(inner, beside)
 
     def _of_nuisances(self, drifts: Array, precisions: Array, slopes: Array) -> tuple[Array, Array]:
         """1 + N'PN (Z, m, m) and N'P J (Z, m, k) for the columns N of nuisances and J of others."""

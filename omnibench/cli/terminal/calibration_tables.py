@@ -17,6 +17,7 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.path_errors import PathError
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.calibration_report import parameter_table
@@ -245,6 +246,30 @@ def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
         print_table(console, Table("errors by kind of reference", headings, tuple(rows), note))
 
 
+def print_path_errors(console: Console, errors: Sequence[PathError], calibration: Calibration) -> None:
+    """Print the errors to expect at the ends of paths, with what holds 95 % of them; nothing where there are none."""
+    rows = []
+    for path in dict.fromkeys(error.path for error in errors):
+        by_model = {error.model: error for error in errors if error.path == path}
+        both = (by_model["design"], by_model["calibration"])
+        places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
+        turns = (f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both)
+        rows.append(Row.of(path, *places, *turns))
+    columns = (
+        Column("path", numeric=False),
+        *(Column(f"position, {model}", "mm") for model in ("design", "calibration")),
+        *(Column(f"heading, {model}", "deg") for model in ("design", "calibration")),
+    )
+    runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
+    if rows:
+        print_table(console, Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows)))
+
+
+def _figures(value: float) -> str:
+    """A number with two figures, or all before its point."""
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+
+
 def _size(value: float, unit: str) -> str:
     return f"{math.degrees(value):.2f} deg" if unit == "rad" else f"{1000 * value:.1f} mm"
 
@@ -269,7 +294,7 @@ def print_verdict_ending(
 
 def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
     """The next step with a calibration in words, then the words to type: an export, or a node if none holds it."""
-    if left_out(calibration):
+    if calibration.plain is None and left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
     # The format to try first: parameters of a ROS 2 controller where one suits the robot.
     export_format = "ros2_controllers"
