@@ -169,15 +169,15 @@ def usual_problem(robot: Robot, runs: Sequence[Trajectory], integration: Integra
 
 STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
 # Factors on the measured angle about which a gain is looked for, each known to itself, so that its neighbours are
-# within a standard deviation: gears between an encoder and its wheel are seldom known worse (tests/fit/test_calibrate.py).
+# within a standard deviation: gears between an encoder and its wheel are seldom known worse (tests/fit).
 _FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
     """Gain, play and coupling of a robot's steering, or a car's zero; a gain's prior about each of some factors.
 
-    Their plausible ranges are their standard deviations, but a gain's is its factor. A lag is not among them: a wrong clock of the reference looks
-    alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
+    Their plausible ranges are their standard deviations, but a gain's is its factor. A lag is not among them: a wrong
+    clock of the reference looks alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
     """
     parameters = [
         (effect.name, parameter)

@@ -20,7 +20,7 @@ from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.path_errors import PathError
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.calibration_report import parameter_table
+from omnibench.report.calibration_report import parameter_table, path_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
@@ -248,26 +248,8 @@ def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
 
 def print_path_errors(console: Console, errors: Sequence[PathError], calibration: Calibration) -> None:
     """Print the errors to expect at the ends of paths, with what holds 95 % of them; nothing where there are none."""
-    rows = []
-    for path in dict.fromkeys(error.path for error in errors):
-        by_model = {error.model: error for error in errors if error.path == path}
-        both = (by_model["design"], by_model["calibration"])
-        places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
-        turns = (f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both)
-        rows.append(Row.of(path, *places, *turns))
-    columns = (
-        Column("path", numeric=False),
-        *(Column(f"position, {model}", "mm") for model in ("design", "calibration")),
-        *(Column(f"heading, {model}", "deg") for model in ("design", "calibration")),
-    )
-    runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
-    if rows:
-        print_table(console, Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows)))
-
-
-def _figures(value: float) -> str:
-    """A number with two figures, or all before its point."""
-    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
+    if errors:
+        print_table(console, path_table(errors, calibration))
 
 
 def _size(value: float, unit: str) -> str:
