@@ -339,7 +339,8 @@ def calibrate(
     robot, training = dataset.robot, training_split(dataset)
 
     # The choices, with what is usual for this robot and these runs.
-    chosen, calibrator = complete_settings(_with_choices(settings, choices), robot, training)
+    asked = _with_choices(settings, choices)
+    chosen, calibrator = complete_settings(asked, robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
     terms: tuple[Term, ...] = ()
@@ -369,7 +370,7 @@ def calibrate(
     # The physical parameters, the calibration file, and what the data leave open.
     searched = problem.parameterisation
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
-    fitted_mount = chosen.mount == "fit"
+    fitted_mount = (asked.mount or default_mount(robot)) == "fit"
     reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
     return CalibrationRun(
         calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),
