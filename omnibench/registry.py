@@ -14,7 +14,8 @@ import pkgutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -104,10 +105,11 @@ class Registry(Generic[T]):
         self.contract: type = object  # base class of all its classes; set by the module that defines it
         self._builtin = builtin
         self._entries: dict[str, Entry[T]] = {}
+        self._former: dict[str, str] = {}  # name that it had -> name
         self._complete = False
 
-    def register(self, name: str) -> Callable[[C], C]:
-        """Class decorator: make the class known as ``name``.
+    def register(self, name: str, former: Sequence[str] = ()) -> Callable[[C], C]:
+        """Class decorator: make the class known as ``name``, and by the names that it or its forerunners had.
 
         Raises PluginError when the name is taken by another class, or the class does not keep the contract.
         """
@@ -131,6 +133,7 @@ class Registry(Generic[T]):
                 origin = str(Path(file).resolve())
             cls.name = name
             self._entries[name] = Entry(name, cls, origin)
+            self._former |= dict.fromkeys(former, name)
             return cls
 
         return decorate
@@ -141,8 +144,14 @@ class Registry(Generic[T]):
         return [self._entries[name] for name in sorted(self._entries)]
 
     def entry(self, name: str, where: str = "") -> Entry[T]:
-        """The entry called ``name``; UnknownNameError names the nearest one and lists all."""
+        """The entry called ``name``; UnknownNameError names the nearest one and lists all.
+
+        A FutureWarning says the new name of one that has been renamed.
+        """
         self._load_builtin()
+        if (new := self._former.get(name)) is not None:
+            warnings.warn(f"{self.kind} {name} is now called {new}", FutureWarning, stacklevel=2)
+            name = new
         require_choice(self.kind, name, self._entries, where)
         return self._entries[name]
 

@@ -8,10 +8,9 @@ import numpy as np
 
 from omnibench.data.dataset import make_dataset
 from omnibench.errors import NotApplicableError
-from omnibench.fit.calibrator import Calibrator, Outcome, Solution
+from omnibench.fit.calibrator import Calibrator, Outcome, Solution, run_calibrator
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
-from omnibench.fit.shrinkage import closed_form_result
 from omnibench.progress import Progress
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import ModelExtension
@@ -44,7 +43,7 @@ class Discovered(Calibrator):
         if not all(run.has_poses for run in problem.trajectories):
             raise NotApplicableError("discover needs reference poses along the path of every run")
 
-        plain = closed_form_result(problem)  # from now on the best vector of the problem
+        plain = run_calibrator(calibrators.create("closed_form"), problem)  # from now on the best vector of the problem
         steps = set[str]()
 
         def watch(event: Progress) -> None:

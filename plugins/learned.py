@@ -35,11 +35,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
-from omnibench.errors import NotApplicableError, PluginError
-from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, model_of_answer
+from omnibench.errors import ConfigError, NotApplicableError, PluginError
+from omnibench.fit.calibrator import Calibrator, Outcome, RunResult, Solution, model_of_answer, run_calibrator
 from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.problem import CalibrationProblem
-from omnibench.fit.shrinkage import shrunk_closed_form
 from omnibench.fit.uncertainty import NoCovarianceError, uncertainty_of
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
@@ -90,16 +89,17 @@ class Learned(Calibrator):
         """
         trainer = _trainer(self.name)
         units = _units(problem.trajectories)
-        plain, shrunk = shrunk_closed_form(problem)
-        assert plain.vector is not None and shrunk.matrix is not None  # noqa: PT018 (closed_form has answered)
+        plain = run_calibrator(calibrators.create("closed_form"), problem)
+        if plain.vector is None or plain.matrix is None:
+            raise ConfigError(f"closed_form, from which it begins, gave no answer: {plain.reason}")
         if problem.best_cost <= problem.objective.rounding and not self.alone:
             return _matrix_alone(plain, "the matrix leaves no error to learn")
         if problem.seconds_left <= 0:
             return _matrix_alone(plain, "no time was left to train a network", ended=True)
-        task = _Task.of(problem, shrunk.matrix, self.alone)
+        task = _Task.of(problem, plain.matrix, self.alone)
         training = _Training(task, self.options, units, problem, trainer)
         chosen = training.best()
-        share = 1.0 if self.alone else _share(problem, shrunk.matrix, chosen.of_folds, training.folds, units)
+        share = 1.0 if self.alone else _share(problem, plain.matrix, chosen.of_folds, training.folds, units)
         done = f"{training.epochs} epochs on {len(set(units))} {_kind(units, problem.trajectories)}"
         done += ", when the time was spent" if training.cut else ""
         if not share:
@@ -109,11 +109,11 @@ class Learned(Calibrator):
             f"held-out loss {chosen.loss:.3g} (matrix {training.of_matrix:.3g}), share {share:g}"
         )
         return Solution(
-            np.array(shrunk.vector),
+            np.array(plain.vector),
             reason,
             converged=not training.cut and plain.outcome is Outcome.CONVERGED,
-            noise=shrunk.noise,
-            extension=_extension(problem, shrunk, chosen.network, share),
+            noise=plain.noise,
+            extension=_extension(problem, plain, chosen.network, share),
         )
 
 
@@ -125,7 +125,7 @@ class LearnedAlone(Learned):
 
 
 def _matrix_alone(plain: RunResult, why: str, *, ended: bool = False) -> Solution:
-    """The answer of closed_form, which is shrunk as ever afterwards."""
+    """The answer of closed_form."""
     assert plain.vector is not None  # closed_form has answered
     converged = not ended and plain.outcome is Outcome.CONVERGED
     return Solution(np.array(plain.vector), f"{plain.reason}; the matrix alone: {why}", converged)
@@ -177,17 +177,17 @@ def _term(network: Network, share: float) -> EffectTerm:
     return EffectTerm(name="learned", parameters={"share": share}, weights=encode_weights(network.packed()))
 
 
-def _extension(problem: CalibrationProblem, shrunk: RunResult, network: Network, share: float) -> ModelExtension:
+def _extension(problem: CalibrationProblem, plain: RunResult, network: Network, share: float) -> ModelExtension:
     """The network, the motions it was trained on, and the matrix to which it fades beyond.
 
     The covariance of the matrix is that of its fit. The variance of the share is such that, by Eq. (3) and (4) of
     corrections.py, the network is gone at one width from the motions that it was trained on.
     """
-    assert shrunk.matrix is not None  # there is an answer
-    matrix, size = shrunk.matrix, shrunk.matrix.size
+    assert plain.matrix is not None  # there is an answer
+    matrix, size = plain.matrix, plain.matrix.size
     covariance = np.zeros((size + 1, size + 1))
     with suppress(NoCovarianceError):
-        covariance[:size, :size] = uncertainty_of(problem, shrunk).covariance
+        covariance[:size, :size] = uncertainty_of(problem, plain).covariance
     covariance[size, size] = share**2 / GROWTH
     motions = [motions_of(matrix, run.times, run.signals) for run in problem.trajectories]
     driven = representatives(problem.robot, np.concatenate(motions))

@@ -4,6 +4,7 @@
 without ``from __future__ import annotations``: Typer evaluates such annotations from their text, twice.
 """
 
+import warnings
 from typing import Annotated, Any
 
 import typer
@@ -49,6 +50,22 @@ def _print_version(asked: bool) -> None:
     raise typer.Exit
 
 
+def _show_renamings_once() -> None:
+    """Let a FutureWarning, such as of a former name, come out as one line of the command, once for each text."""
+    show_others, said = warnings.showwarning, set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **others: Any) -> None:
+        from omnibench.cli.terminal.console import warn
+
+        if not issubclass(category, FutureWarning):
+            show_others(message, category, *rest, **others)
+        elif (text := str(message)) not in said:
+            said.add(text)
+            warn([text])
+
+    warnings.showwarning = show
+
+
 app = typer.Typer(
     name="omnibench",
     cls=CommandsByFamily,
@@ -62,11 +79,12 @@ app = typer.Typer(
 
 @app.callback()
 def options_of_all(
-    version: Annotated[
+    version: Annotated[  # noqa: ARG001 (printed by its callback)
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     """Options of omnibench itself, before any command."""
+    _show_renamings_once()
 
 
 for heading, family in FAMILIES:

@@ -163,6 +163,11 @@ def calibrate(
     output: Annotated[
         Path | None, shared.output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
+    ] = None,
+    figures: shared.Figures = None,
     backend: shared.BackendName = None,
     workers: shared.Workers = None,
     tls_ca: shared.TlsAuthority = None,
@@ -179,11 +184,13 @@ def calibrate(
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
     from omnibench.config import parse_settings, to_yaml
+    from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
     chosen = shared.chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
-    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.bootstrap",)
+    shared.refuse_report(report, figures, force=force)
+    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ()
     with (
         redirect_stdout(sys.stderr),
         ProgressDisplay() as watch,
@@ -196,18 +203,20 @@ def calibrate(
         write_text(output, to_yaml(calibration))
     warnings = [*recordings.warnings, *run.warnings]
     if result.at_bounds:
-        when = "" if result.shrinkage is None else " before the answer was shrunk to the design"
-        bounds = f"on a bound of the box {chosen.box!r}{when}: {', '.join(result.at_bounds)}"
+        bounds = f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}"
         warnings.append(f"{bounds}; a wider box may fit better")
     if run.untouched:
         held = f"kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"
         warnings.append(f"not fitted, {held}")
     warn(warnings)
-    if as_json:
-        return print_json(calibration)
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
     verdict = calibration.provenance.held_out
+    shared.write_asked_report(
+        lambda: calibration_document(calibration, recordings, verdict, run.warnings), report, figures, announced=True
+    )
+    if as_json:
+        return print_json(calibration)
     file = [] if output is None else [f"calibration: {output}"]
     ending = [
         "whether it is better, and what to do next, in a line that is longer than many terminals are wide",
@@ -217,7 +226,7 @@ def calibrate(
     for line in file:
         typer.echo(line)
     print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
-    if result.at_bounds and result.shrinkage is None and output is not None:
+    if result.at_bounds and output is not None:
         what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
         return print_ending(what, "see what is", "omnibench", "check", *dataset)
     if output is None:
@@ -230,11 +239,17 @@ def calibrate(
 def evaluate(
     calibration: shared.CalibrationFile,
     dataset: shared.DatasetFolders,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
+    ] = None,
+    figures: shared.Figures = None,
     backend: shared.BackendName = None,
     workers: shared.Workers = None,
     tls_ca: shared.TlsAuthority = None,
     tls_cert: shared.TlsCertificate = None,
     tls_key: shared.TlsKey = None,
+    force: shared.Force = False,
     plugins: shared.Plugins = None,
     as_json: shared.Json = False,
 ) -> None:
@@ -243,8 +258,10 @@ def evaluate(
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
     """
     from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
+    from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
+    shared.refuse_report(report, figures, force=force)
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
         recordings = omnibench.load_dataset(dataset)
@@ -252,6 +269,12 @@ def evaluate(
         evaluation = omnibench.evaluate(evaluated, recordings)
     warnings = [*recordings.warnings, *evaluation.warnings]
     warn(warnings)
+    shared.write_asked_report(
+        lambda: calibration_document(evaluated, recordings, evaluation.held_out, evaluation.warnings),
+        report,
+        figures,
+        announced=True,
+    )
     if as_json:
         return print_json(evaluation.model_dump() | {"warnings": warnings})
     print_evaluation(make_console(), evaluation)

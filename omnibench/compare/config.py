@@ -62,11 +62,12 @@ class CalibratorEntry(Model):
 
     def settings(self, common: FitSettings) -> CompleteSettings:
         """The settings of the entry's fit: those common to a comparison, with its own and its calibrator's."""
-        calibrator = calibrators.entry(self.name).cls
+        entry = calibrators.entry(self.name)
+        calibrator = entry.cls
         assert common.unidentified is not None  # a comparison says it
         unidentified, mount = as_answered(calibrator, common.unidentified, common.mount)
         of_entry = {
-            "calibrator": self.name,
+            "calibrator": entry.name,
             "options": self.options,
             "parameterisation": self.parameterisation or calibrator.parameterisation,
             "box": self.box or common.box,
@@ -138,14 +139,14 @@ class CompareConfig(NamedConfig):
     box: Box = "row"
     unidentified: Unidentified = Field(
         "keep",
-        description="what the data hardly tell: keep the design values of motions that they hardly drive, fit these to "
-        "slip and noise, or shrink every answer to the design in proportion to what is known",
+        description="what the data hardly tell: keep the design values of motions that they hardly drive, or fit these "
+        "to slip and noise; map weighs all against the design",
     )
     mount: MountChoice | None = Field(
         None, description="tracked point of a robot that cannot slide: known, or fitted; default: by the robot's class"
     )
     tolerance: Positive | None = Field(
-        None, description="of the design, share of each row's largest element, for shrink; default: the robot class's"
+        None, description="of the design, share of each row's largest element, for map; default: the robot class's"
     )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")

@@ -14,7 +14,6 @@ from omnibench.compare.plan import PlannedRun, RunTask
 from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
 from omnibench.fit.problem import make_problem
-from omnibench.fit.shrinkage import shrunk
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.processes import interrupts_not_in_callbacks
 from omnibench.progress import Progress, Reporter
@@ -80,7 +79,7 @@ def _solve(task: RunTask, report: Reporter) -> RunResult:
         load_calibrators(task.plugins, [task.settings.calibrator])
         calibrator = calibrators.create(task.settings.calibrator, task.settings.options)
         problem = make_problem(task.settings, task.robot, task.trajectories, report)
-        result = shrunk(problem, run_calibrator(calibrator, problem), fitted=calibrator.fitted)
+        result = run_calibrator(calibrator, problem)
         if task.timing and result.matrix is not None:
             # Wall time in s of one evaluation of the start's cost by direct integration, the best of a few
             spent = []

@@ -15,7 +15,7 @@ from omnibench.data.splits import training_split
 from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator
-from omnibench.fit.prior import default_cost, default_unidentified
+from omnibench.fit.prior import default_cost
 from omnibench.fit.problem import make_parameterisation
 from omnibench.registry import Entry, calibrators, load_plugins
 
@@ -39,7 +39,6 @@ def recording_config(places: Path | Sequence[Path], plugins: Sequence[Path] = ()
         "name": name,
         "datasets": {name: {"path": paths if len(paths) > 1 else paths[0]}},
         "cost": default_cost(dataset.robot, len(training_split(dataset))),
-        "unidentified": default_unidentified(dataset.robot),
         "budget": {"evaluations": _EVALUATIONS, "seconds": _SECONDS},
         "calibrators": suitable_calibrators(dataset),
         "plugins": [str(path.resolve()) for path in plugins],

@@ -42,7 +42,7 @@ from omnibench.fit.identifiability import warnings_of_calibration
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.ratio_intervals import UnitName, units_of
 from omnibench.fit.reference_rows import with_mean_errors
-from omnibench.fit.span import driven_span
+from omnibench.fit.span import Treatment, driven_span
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import ResultStore
@@ -440,7 +440,8 @@ def _warnings(
     ):
         dataset = datasets[name]
         span = driven_span(dataset.split("train"))
-        undetermined = warnings_of_calibration(dataset.robot, span, parameterisation, config.unidentified)
+        treatment: Treatment = "fit" if config.unidentified == "fit" else "keep"
+        undetermined = warnings_of_calibration(dataset.robot, span, parameterisation, treatment)
         yield from (f"data set {name}, fit of the {parameterisation}: {warning}" for warning in undetermined)
     if config.loss != "squares":
         first = {run.dataset_name: run for run in reversed(plan)}

@@ -526,17 +526,17 @@ def _select(
 
 
 def _start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
-    """The matrix (3, N) to begin at. Raises DataError for a calibration that has effects or other wheels."""
+    """The matrix (3, N) to begin at, that without effects. DataError: it is not known, or the wheels are others."""
     if calibration is None:
         return dataset.robot.inverse_kinematic_matrix
-    if calibration.effects:
+    if calibration.effects and calibration.plain is None:
         names = ", ".join(term.name for term in calibration.effects)
         raise DataError(
             f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
             "matrix; give one without effects, such as the plain.yaml beside it, or none"
         )
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
-    return calibration.matrix_array
+    return calibration.matrix_without_effects
 
 
 def located(

@@ -29,12 +29,13 @@ from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, sl
 from omnibench.discover.regressors.significance import Group
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
-from omnibench.fit.calibrators.trajectory_ml import FitCovariance
+from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog, split_by
+from omnibench.robot.physical import EstimatedCovariance
 
 _ENOUGH = 30  # runs that are not cut: signs of fewer are flipped in too few ways for chances of 0.002 to be known well
 _MOST = 60  # windows of all drives, at most; chosen
@@ -408,7 +409,7 @@ class Extended:
     data: fits.Whitened
     columns: tuple[Array, ...]
     values: Array
-    covariance: fits.EstimatedCovariance
+    covariance: EstimatedCovariance
 
     @property
     def residuals_without_effects(self) -> list[Array]:
@@ -460,10 +461,8 @@ def fit_matrix(
 def extend(plain: Fit, groups: Sequence[Group]) -> Extended:
     """Fit matrix and effects together, from the plain matrix and effects of 0; noise stays where there are none."""
     fit, values, data, columns = _in_turn(plain, groups) if groups else _descend(plain, (), np.zeros(0))
-    # Covariance (p, p) of the fitted numbers: by the noise model, or by the runs where they scatter more
-    unit = fits.given(data, []).scale(range(len(data.information)))
-    covariance = FitCovariance(data, fit.runs, fit.noise, unit)
-    return Extended(fit, tuple(groups), data, columns, values, covariance.chosen(covariance.scatter_stands)[0])
+    covariance = jackknife(data.information_of_runs, data.scores, Clusters.of(fit.runs))
+    return Extended(fit, tuple(groups), data, columns, values, covariance)
 
 
 def _in_turn(fit: Fit, groups: Sequence[Group]) -> tuple[Fit, Array, fits.Whitened, tuple[Array, ...]]:

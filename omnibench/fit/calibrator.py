@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from omnibench.errors import ConfigError, DataError, NotApplicableError, Omniben
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.prior import MountChoice
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem, Improvement
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Treatment, Unidentified
 from omnibench.jobs.job_process import memory_limit
 from omnibench.registry import AnyOptions, Options, PluginFailure, calibrators
 from omnibench.robot import calibration as saved
@@ -60,7 +61,8 @@ class Calibrator(ABC):
 
     parameterisation: the one it searches unless the config names another.
     bounded: False if the answer does not depend on the box (a published matrix, a closed form of an article).
-    as_is: True if its answer stands as it is, as an article's: neither shrunk nor kept to the design.
+    as_is: True if its answer stands as it is, as an article's, and is not kept to the design along any motion.
+    weighs_design: True if it weighs what the runs say of every motion against the design by itself.
     fitted: False if the answer does not depend on the runs (the design values, a published matrix).
     per_session: True if its article calibrates from the runs of one session, so that it refuses those of several.
     only_for: the robots that it is for, in words, where these are not all; then override ``applies``.
@@ -77,6 +79,7 @@ class Calibrator(ABC):
     parameterisation: ClassVar[ParameterisationName] = "matrix"
     bounded: ClassVar[bool] = True
     as_is: ClassVar[bool] = False
+    weighs_design: ClassVar[bool] = False
     fitted: ClassVar[bool] = True
     per_session: ClassVar[bool] = False
     only_for: ClassVar[str] = ""
@@ -111,17 +114,20 @@ calibrators.contract = Calibrator
 
 def as_answered(
     calibrator: type[Calibrator] | Calibrator, unidentified: Unidentified, mount: MountChoice | None
-) -> tuple[Unidentified, MountChoice | None]:
-    """How answers are treated: as asked for, unless they stand as they are."""
-    return ("fit", "fit") if calibrator.as_is else (unidentified, mount)
-
-
-@dataclass(frozen=True)
-class Shrinkage:
-    """An answer's shrinkage to the design: its cost before, and the source of the covariance after, in words."""
-
-    unshrunk_cost: float
-    source: str
+) -> tuple[Treatment, MountChoice | None]:
+    """How answers are treated: as asked for, unless they stand as they are or weigh the design by themselves."""
+    if calibrator.as_is:
+        return "fit", "fit"
+    if calibrator.weighs_design:
+        return "weigh", mount
+    if unidentified == "shrink":
+        warnings.warn(
+            f"unidentified: shrink is what calibrator map does by itself; {calibrator.name} keeps the design instead",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return "keep", mount
+    return unidentified, mount
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ class RunResult(Brief):
 
     at_bounds, held: names of elements on a bound of the box, and of those kept at their start values.
     covariance (n, n), degrees_of_freedom (n,), noise: as in Solution, None if the calibrator does not estimate them.
-    shrinkage: None where the answer is the calibrator's own. timing: None where the seconds are not to be compared.
+    timing: None where the seconds are not to be compared.
     extension: effects that belong to the answer beside the matrix, None for none.
     """
 
@@ -155,7 +161,6 @@ class RunResult(Brief):
     covariance: JsonArray | None = None
     noise: saved.Noise | None = None
     degrees_of_freedom: JsonArray | None = None
-    shrinkage: Shrinkage | None = None
     timing: Timing | None = None
     extension: saved.ModelExtension | None = None
 

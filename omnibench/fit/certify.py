@@ -468,9 +468,9 @@ class Proof(Brief):
 class Certificate(Model):
     """Largest possible distance of a calibration's cost from the optimum: ``gap`` = 1 - lower_bound / cost.
 
-    cost: on the training split; of a calibration that was shrunk to the design, that of the optimum before.
-    lower_bound: no matrix in the box costs less. shrinking: share that shrinking adds to that optimum's cost; None for
-    a calibration that was not shrunk.
+    cost: on the training split; of a calibration that has effects or weighs the design, that of the optimum without.
+    lower_bound: no matrix in the box costs less. shrinking: share by which the calibration costs more than that
+    optimum; None for others.
     """
 
     cost: float
@@ -506,13 +506,14 @@ def certify_optimum(
 ) -> CertifiedCalibration:
     """Bound how much better than a calibration any matrix of the box could be, on a data set's training split.
 
-    Cost and integration are those of the calibration. Of one that was shrunk to the design, the unshrunk optimum is
-    certified, found anew, and what shrinking costs is said. box: default the one that was searched, or ``row``.
+    Cost and integration are those of the calibration. Of one that has effects, or weighs the design, the optimum of the
+    matrix alone is certified, found anew, and by how much the calibration costs more. box: default the one that was
+    searched, or ``row``.
     watch: told early about how long the proof takes, then of every part.
     gap: stop when the best known matrix is proven to be this close to the optimum. seconds, parts: stop after this time
     or after so many parts of the box; the number ends a proof at the same place on every machine. backend: bounds parts
     as jobs, several at once; the proof is then the same on every backend, and has other parts than without one.
-    Raises DataError when the wheels differ, the calibration has effects or was fitted with a robust loss, or the
+    Raises DataError when the wheels differ, the calibration was fitted with a robust loss, or the
     training split is empty, ConfigError for a cost that is no sum of norms.
     """
     require_type(calibration, Calibration, "read_calibration")
@@ -521,12 +522,6 @@ def certify_optimum(
         require_choice("box", box, get_args(BoxName))
     require_range("gap", gap, 0, 1)
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
-    if calibration.effects:
-        named = ", ".join(term.name for term in calibration.effects)
-        raise DataError(
-            f"calibration {calibration.name!r} has effects ({named}), and a bound is proven for a matrix alone; "
-            "certify the calibration without them"
-        )
     provenance = calibration.provenance
     if provenance is not None and provenance.loss is not None:
         raise DataError(
@@ -545,13 +540,16 @@ def certify_optimum(
     )
     problem = make_problem(settings, dataset.robot, training_split(dataset))
     vector = calibration.matrix_array.ravel()
-    cost = float(problem.values(vector[None])[0])
+    cost = problem.objective.of_model(calibration.model, problem.trajectories)
     inside = bool(problem.inside(vector[None])[0])
     shrinking = None
-    if provenance is not None and provenance.unidentified == "shrink":
+    weighed = provenance is not None and provenance.unidentified in ("shrink", "weigh")
+    if calibration.effects or weighed:
         optimum = run_calibrator(calibrators.create(settings.calibrator), problem)
         if optimum.vector is None or optimum.cost is None:
-            raise DataError(f"calibration {calibration.name!r}: its unshrunk optimum is not found: {optimum.reason}")
+            raise DataError(
+                f"calibration {calibration.name!r}: the optimum of the matrix alone is not found: {optimum.reason}"
+            )
         if optimum.cost > problem.objective.rounding:  # no share of rounding means anything
             vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
     began = time.perf_counter()

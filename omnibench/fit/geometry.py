@@ -7,7 +7,6 @@ are effects, too.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -17,7 +16,6 @@ from pydantic import Field, FiniteFloat, field_validator
 
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
-from omnibench.fit.prior import tolerance_of
 from omnibench.robot import kinematics
 from omnibench.robot.geometry import Geometry, Number
 from omnibench.robot.physical import PhysicalParameter, unit_of
@@ -62,7 +60,6 @@ class WheelGeometry:
     robot: kinematics.Robot
     limits: GeometryLimits | None = None
     fitted_mount: bool = False
-    tolerance: float | None = None
     name: ParameterisationName = field(default="geometry", init=False)
 
     @cached_property
@@ -112,13 +109,6 @@ class WheelGeometry:
         }
         low, high = np.array([ranges[number.kind] for number in self._numbers]).T
         return checked(Bounds("limits", self.start + low * self.scale, self.start + high * self.scale), self)
-
-    @property
-    def prior_root(self) -> kinematics.Array:
-        tolerance = tolerance_of(self.robot, self.tolerance)
-        of_lengths = math.hypot(tolerance.elements, max(tolerance.rows))  # what shortens a motion does so as a length
-        shares = [tolerance.elements if unit_of(name) == "rad" else of_lengths for name in self.names]
-        return np.diag(shares * self.scale)
 
     @property
     def projection(self) -> kinematics.Array:

@@ -153,18 +153,18 @@ def _advice(motion: str) -> str:
 
 
 def kept_motions(
-    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, unidentified: spans.Unidentified
+    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, treatment: spans.Treatment
 ) -> tuple[spans.WheelDirection, ...]:
     """Motions that runs with this span do not identify, of which a calibration keeps the design values."""
-    if parameterisation == "geometry":
+    if parameterisation == "geometry" or treatment == "weigh":
         return ()
     directions = spans.wheel_directions(robot, span)
     open_ones = (each for each in directions if not each.identified and each.motion)
-    return tuple(each for each in open_ones if not (each.state == "weak" and unidentified == "fit"))
+    return tuple(each for each in open_ones if not (each.state == "weak" and treatment == "fit"))
 
 
 def warnings_of_calibration(
-    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, unidentified: spans.Unidentified
+    robot: Robot, span: spans.DrivenSpan, parameterisation: ParameterisationName, treatment: spans.Treatment
 ) -> tuple[str, ...]:
     """A sentence for every direction that runs with this span do not identify, and how a calibration treats it."""
     sentences = []
@@ -176,7 +176,9 @@ def warnings_of_calibration(
             subject += f": {each.share_in_words}, which slip alone can make"
         if parameterisation == "geometry":
             end = "the geometry cannot keep design values there, so what was fitted to it rests on slip and noise"
-        elif each.state == "weak" and unidentified == "fit":
+        elif treatment == "weigh":
+            end = "there the matrix is known by the design and its tolerance"
+        elif each.state == "weak" and treatment == "fit":
             end = "what was fitted there rests on slip and noise"
         else:
             end = "kept at the design values"

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.data.stored import median_period
 from omnibench.fit.cost import NO_ERROR
-from omnibench.fit.prior import default_cost, prior_root, tolerance_of
-from omnibench.fit.reference_fit import ReferenceFit
+from omnibench.fit.estimate import EstimateProblem, estimate
+from omnibench.fit.prior import default_cost, physical_prior_root, physical_tolerance
 from omnibench.fit.span import directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
@@ -29,7 +30,6 @@ _SPARSE = 1.0  # s between poses, from which on headings do not lie on lines bet
 _REWEIGHTED = 10  # steps, of which the best counts; chosen: on README's log the cost is within 1 % of closed_form's
 _VANISHING = 1e-3  # of the mean norm: smaller ones have no larger weight; chosen
 _MOST_POSES = 100_000  # a quick fit takes every n-th pose of n times as many: fewer than twice this number; chosen
-_STEPS = 3  # Gauss-Newton steps by references, chosen: the design is so near that two settle
 
 
 def linear_fit(
@@ -71,7 +71,9 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
     """The matrix (3, M) that fits the poses of runs, or, where none has any, their references."""
     posed = [run for run in runs if run.has_poses]
     if not posed:
-        return _by_references(robot, runs)
+        root = physical_prior_root(robot, physical_tolerance(robot))
+        period = median_period(runs)
+        return estimate(EstimateProblem(robot, runs, root, integration, period)).matrix
     if (every := sum(len(run.poses) for run in posed) // _MOST_POSES) > 1:
         thinned = slice(None, None, every)
         posed = [
@@ -80,7 +82,7 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
         ]
     odometry = odometry_of([run.reference_log for run in posed], integration)
     observed = np.concatenate([run.poses[1:] for run in posed])
-    held = directions_kept(robot, driven_span(posed), "shrink")
+    held = directions_kept(robot, driven_span(posed), "keep")
     _, _, directions = np.linalg.svd(np.vstack([held, np.zeros((1, len(robot.drive.names)))]))
     directions = directions[len(held) :]
     matrix = linear_fit(odometry, posed, observed, robot.inverse_kinematic_matrix, directions)
@@ -101,19 +103,3 @@ def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration
         step = np.linalg.lstsq(columns.reshape(errors.size, -1), (roots * errors).ravel(), rcond=None)[0]
         matrix = matrix - (free @ step).reshape(matrix.shape)
     return min(tried)[2]
-
-
-def _by_references(robot: Robot, runs: Sequence[Trajectory]) -> Array:
-    """The likeliest matrix (3, M) of the class's tolerance about the design, by the references' own uncertainty."""
-    design = robot.inverse_kinematic_matrix
-    root = prior_root(robot, tolerance_of(robot))
-    fit = ReferenceFit.of(runs, design, "arc")
-    if fit is None:
-        return design
-    fit = fit.with_walk(design, root)
-    steps = np.zeros(root.shape[1])
-    for _ in range(_STEPS):
-        residuals, columns = fit.whitened(design + (root @ steps).reshape(design.shape), root)
-        slopes, errors = np.concatenate(columns), np.concatenate(residuals)
-        steps = steps + np.linalg.solve(slopes.T @ slopes + np.eye(len(steps)), slopes.T @ errors - steps)
-    return design + (root @ steps).reshape(design.shape)

@@ -19,7 +19,7 @@ from omnibench.data.references import UNITS
 from omnibench.fit.parameterisation import MatrixElements, Parameterisation
 from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
-from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span
+from omnibench.fit.span import DrivenSpan, Treatment, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
 from omnibench.words import plural
@@ -78,7 +78,7 @@ def open_directions(searched: MatrixElements, information: Array) -> Array:
 def open_sentences(
     robot: Robot,
     runs: Sequence[Trajectory],
-    unidentified: Unidentified = "keep",
+    treatment: Treatment = "keep",
     mount: MountChoice | None = None,
     *,
     span: DrivenSpan | None = None,
@@ -86,10 +86,10 @@ def open_sentences(
     """A sentence for each part of the matrix that the runs' references leave open; none where all runs have poses."""
     if all(run.references is None for run in runs):
         return ()
-    kept = directions_kept(robot, span or driven_span(runs), unidentified)
+    kept = directions_kept(robot, span or driven_span(runs), treatment)
     searched = MatrixElements(robot, "row", kept, (mount or default_mount(robot)) == "known")
     searched = with_open_combinations(searched, runs)
-    end = "keeps the design values" if unidentified != "shrink" else "rests on the design and its tolerance"
+    end = "rests on the design and its tolerance" if treatment == "weigh" else "keeps the design values"
     return tuple(_sentences(searched, runs, end))
 
 

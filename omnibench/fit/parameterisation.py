@@ -11,7 +11,6 @@ from pydantic import FiniteFloat
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError
-from omnibench.fit.prior import prior_root, tolerance_of
 from omnibench.robot.kinematics import Array, Robot
 
 ParameterisationName = Literal["matrix", "geometry"]
@@ -59,10 +58,6 @@ class Parameterisation(Protocol):
     @property
     def bounds(self) -> Bounds: ...
     @property
-    def prior_root(self) -> Array:
-        """A root (n, k) of the covariance that the numbers of such robots have about the design."""
-
-    @property
     def projection(self) -> Array:
         """The matrix (n, n) that takes from a deviation of the vector what leaves the matrix as it is."""
 
@@ -79,17 +74,15 @@ class MatrixElements:
 
     null (q, M): orthonormal directions of drive signals that the data do not identify; along them the matrix keeps its
     start values. known_mount: the matrix gives a robot that cannot slide only twists in which its fixed wheels do not,
-    the tracked point being where the robot says; False: it may be elsewhere. tolerance: how far designs are
-    off, as a share of each row's largest element; None: that of the class. open (q, 3M): orthonormal combinations of
-    elements, in units of their rows' largest, that references other than poses leave open; along them the matrix keeps
-    its start values, too.
+    the tracked point being where the robot says; False: it may be elsewhere. open (q, 3M):
+    orthonormal combinations of elements, in units of their rows' largest, that references other than poses leave open;
+    along them the matrix keeps its start values, too.
     """
 
     robot: Robot
     box: Box
     null: Array
     known_mount: bool = True
-    tolerance: float | None = None
     open: Array | None = None
     name: ParameterisationName = field(default="matrix", init=False)
 
@@ -135,10 +128,6 @@ class MatrixElements:
     def units(self) -> Array:
         """The largest element (3M,) of each element's row, m and rad per rad."""
         return np.repeat(self.robot.row_scales, len(self.robot.drive.names))
-
-    @property
-    def prior_root(self) -> Array:
-        return self.projection @ prior_root(self.robot, tolerance_of(self.robot, self.tolerance))
 
     @cached_property
     def rows(self) -> Array:

@@ -1,46 +1,34 @@
-"""Prior knowledge of a matrix: its design, and by how much robots of a class are off theirs.
+"""Prior knowledge of a matrix: its design, and by how much robots of a class are off theirs before they were driven.
 
-With the design K0 and the largest element s_i of its row i, the elements of a robot's matrix are
+With independent normal numbers of mean 0 the matrix is K0 + D with
 
-    k_ij = k0_ij (1 + g_i) + s_i e_ij                                                             (1)
-
-with independent normal e_ij, for wheels that are not as drawn, and g_i, for what shortens a whole motion: rollers that
-slip, tyres that skid in a turn. A skid-steered base turns about a point (x, y) that is not its middle: by its rates of
-turn, in row 3, the rows of x and y change by
-
-    D_1 = -y K0_3,    D_2 = x K0_3.                                                               (2)
-
-The physical prior of a matrix, and of the rate that its wheels lose, is what is known of a robot before it has been
-driven. With independent normal numbers of mean 0 the matrix is K0 + D with
-
-    D_ij = K0_ij (c_j + g_i) + s_i e_ij + (rotations and shifts below).                             (3)
+    D_ij = K0_ij (c_j + g_i) + s_i e_ij + (rotations and shifts below).                             (1)
 
 c_j: the radius of the wheel of column j, which stretches all of the column. g_i: what shortens a whole motion, such as
-rollers that slip (rows 1 and 2) or tyres that scrub in a turn (row 3). e_ij: all else. A driven wheel that is steered
+rollers that slip (rows 1 and 2) or tyres that scrub in a turn (row 3). s_i e_ij, s_i being the row's largest element:
+all else. A driven wheel that is steered
 by a measured angle has two columns, (omega cos phi, omega sin phi), which share its radius and which the offset a of
 the angle turns into each other:
 
-    D = a K0 [0 -1; 1 0] on these two.                                                              (4)
+    D = a K0 [0 -1; 1 0] on these two.                                                              (2)
 
 Where the tracked point of a robot is not known, it stands at (x, y) from where the robot says, and looks
 into the direction b: the rows of x and y change by
 
-    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                               (5)
+    D_1 = -y K0_3 + b K0_2,    D_2 = x K0_3 - b K0_1.                                               (3)
 
-Every wheel that turns loses the rate -d (effect ``wheel_dead_zone``), d being normal, too.
+A skid-steered base turns about a point (x, y) that is not its middle and is shifted by load and ground: Eq. (3) with
+b = 0. Every wheel that turns loses the rate -d (effect ``wheel_dead_zone``), d being normal, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, PhysicalTolerance
+from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, TURNING_CENTRE, PhysicalTolerance
 from omnibench.robot.geometry import physical_tolerance as physical_tolerance
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 
@@ -51,68 +39,11 @@ _NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen
 _UNKNOWN_MOUNTS: frozenset[RobotClass] = frozenset({"tricycle", "car"})
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """Standard deviations: of every element (e, share of the row's largest) and of each row's factor (g), Eq. (1).
-
-    centre: of the x and y of the centre of turning, m, Eq. (2).
-    """
-
-    elements: float
-    rows: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    centre: float = 0.0
-
-
-# Radius and place of a wheel are known to 1 or 2 %. What all wheels share is known less well: the load on tyres, which
-# changes their radii, and the track on which they turn (Borenstein and Feng, IEEE T-RA 12:869, 1996, sections 2 and 3).
-# Rollers lose or gain some per cent of a motion, 8 on the mecanum base of OptiOdom; a skid-steered base turns by 0.5 to
-# 0.8 of what its track says (Mandow et al., IROS 2007), about a centre that load and ground shift by some cm. If
-# the centre is taken for known, only 80 % of the 95 % intervals of a skid base's turn hold the truth
-# (tests/studies/shrink_coverage.py). tests/studies/shrink_study.py fits with half and twice these tolerances.
-_USUAL = Tolerance(0.02, (0.05, 0.05, 0.05))
-TOLERANCES: Mapping[RobotClass, Tolerance] = MappingProxyType(
-    {
-        "differential": _USUAL,
-        "tricycle": _USUAL,
-        "car": _USUAL,
-        "swerve": _USUAL,
-        "omni": _USUAL,
-        "mecanum": Tolerance(0.02, (0.06, 0.06, 0.06)),
-        "skid": Tolerance(0.02, (0.05, 0.05, 0.2), centre=0.05),
-        "mixed": _USUAL,
-    }
-)
-
-
-def tolerance_of(robot: Robot, elements: float | None = None) -> Tolerance:
-    """The tolerance of a robot's class; elements: another share for the elements, and nothing else is off."""
-    return TOLERANCES[class_of(robot)] if elements is None else Tolerance(elements)
-
-
-def prior_root(robot: Robot, tolerance: Tolerance) -> Array:
-    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) and (2)."""
-    design = robot.inverse_kinematic_matrix
-    elements = np.diag(np.repeat(tolerance.elements * robot.row_scales, design.shape[1]))
-    rows = [share * (np.eye(3)[:, [row]] * design).ravel() for row, share in enumerate(tolerance.rows)]
-    centre = tolerance.centre * changes_by_centre(robot).reshape(2, -1)
-    return np.column_stack([elements, *rows, *centre])
-
-
 def changes_by_centre(robot: Robot) -> Array:
-    """Derivatives (2, 3, M) of the matrix by the x and the y of the point that turns on the spot, 1/m: Eq. (2)."""
+    """Derivatives (2, 3, M) of the matrix by the x and the y of the point that turns on the spot, 1/m: Eq. (3)."""
     turning = robot.inverse_kinematic_matrix[2]
     still = np.zeros_like(turning)
     return np.array([[still, turning, still], [-turning, still, still]])
-
-
-def default_unidentified(robot: Robot) -> Literal["keep", "shrink"]:
-    """The treatment of what data hardly drive: shrunk for robots whose wheels say their types, else kept as ever.
-
-    On omni wheels all is kept: a matrix fitted to the circles of OptiOdom's omni3 and shrunk errs by 0.20 m on its
-    squares, in the place of 0.10 m (tests/studies/shrink_study.py). Its runs differ by more than the matrix can say,
-    and what they say of one row hangs on the others.
-    """
-    return "shrink" if says_types(robot) and class_of(robot) != "omni" else "keep"
 
 
 def says_types(robot: Robot) -> bool:
@@ -136,7 +67,7 @@ def default_mount(robot: Robot) -> MountChoice:
 
 
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
-    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (3) to (5).
+    """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 
     Rows that no wheel drives (the sideways one of a robot that cannot slide) move with the tracked point alone.
     """
@@ -155,6 +86,8 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
             turned = np.zeros_like(design)
             turned[:, pair] = design[:, pair] @ np.array([[0.0, -1.0], [1.0, 0.0]])
             roots.append(turned * STEERING_ZERO)
+    if class_of(robot) == "skid":
+        roots += [*(TURNING_CENTRE * changes_by_centre(robot))]
     if default_mount(robot) == "fit" and not robot.slides:
         x, y, _ = design
         roots += [*(TRACKED_POINT * changes_by_centre(robot)), TRACKED_YAW * np.array([y, -x, np.zeros_like(x)])]

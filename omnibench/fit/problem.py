@@ -24,7 +24,7 @@ from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.settings import Budget as Budget
 from omnibench.fit.settings import CompleteSettings
-from omnibench.fit.span import DrivenSpan, Unidentified, directions_kept, driven_span, unidentified_directions
+from omnibench.fit.span import DrivenSpan, Treatment, directions_kept, driven_span, unidentified_directions
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
@@ -181,7 +181,7 @@ class CalibrationProblem(SearchBox):
     rng: the only source of randomness that a calibrator may use.
     span: what the runs drive; default: computed when it is first asked for.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
-    shrinks: True if the answer is shrunk to the design afterwards.
+    tolerance: standard deviation of the design's elements, for calibrators that weigh it; None: that of the class.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class CalibrationProblem(SearchBox):
         integration: Integration,
         budget: Budget,
         seed: int,
-        shrinks: bool = False,
+        tolerance: float | None = None,
         span: DrivenSpan | None = None,
         watch: Reporter = no_progress,
     ) -> None:
@@ -209,7 +209,7 @@ class CalibrationProblem(SearchBox):
             )
         self.objective = cost
         self.parameterisation = parameterisation
-        self.shrinks = shrinks
+        self.tolerance = tolerance
         self.integration: Integration = integration
         self.seed = seed
         self.rng = np.random.default_rng(seed)
@@ -433,7 +433,6 @@ def make_problem(
         limits=settings.limits,
         unidentified=settings.unidentified,
         mount=settings.mount,
-        tolerance=settings.tolerance,
         span=span,
     )
     return CalibrationProblem(
@@ -444,7 +443,7 @@ def make_problem(
         integration=settings.integration,
         budget=settings.budget,
         seed=settings.seed,
-        shrinks=settings.unidentified == "shrink",
+        tolerance=settings.tolerance,
         span=span,
         watch=watch,
     )
@@ -457,25 +456,25 @@ def make_parameterisation(
     *,
     box: Box = "row",
     limits: GeometryLimits | None = None,
-    unidentified: Unidentified = "keep",
+    unidentified: Treatment = "keep",
     mount: MountChoice | None = None,
-    tolerance: float | None = None,
     span: DrivenSpan | None = None,
 ) -> Parameterisation:
     """The parameterisation called ``name``. ConfigError when its box excludes the start.
 
     unidentified: for directions of wheel rates that the trajectories drive so little that slip alone may explain it,
-    ``keep`` and ``shrink`` hold the matrix at the design values along them, ``fit`` fits it. The geometry always fits
+    ``keep`` holds the matrix at the design values along them, ``fit`` fits it, and ``weigh`` leaves what to do there,
+    and about combinations that references leave open, to the calibrator. The geometry always fits
     them: it cannot hold values along a direction. mount: whether the tracked point of a robot that cannot slide is
-    where the robot says, or fitted; default: see ``default_mount``. tolerance: how far designs are off, as a share of
-    each row's largest element; default: that of the class. span: what the trajectories drive; default: computed here.
+    where the robot says, or fitted; default: see ``default_mount``. span: what
+    the trajectories drive; default: computed here.
     """
     mount = mount or default_mount(robot)
     if name == "geometry":
-        return WheelGeometry(robot, limits, mount == "fit", tolerance)
+        return WheelGeometry(robot, limits, mount == "fit")
     null = directions_kept(robot, span or driven_span(trajectories), unidentified)
-    searched = MatrixElements(robot, box, null, mount == "known", tolerance)
-    return searched if unidentified == "shrink" else with_open_combinations(searched, trajectories)
+    searched = MatrixElements(robot, box, null, mount == "known")
+    return searched if unidentified == "weigh" else with_open_combinations(searched, trajectories)
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -55,8 +55,8 @@ from scipy.special import stdtrit
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
 from omnibench.fit.noise import grouped
-from omnibench.fit.trajectory_fit import INTERVAL
 from omnibench.robot.kinematics import Array
+from omnibench.robot.physical import INTERVAL
 from omnibench.words import plural
 
 UnitName = Literal["command", "run"]

@@ -72,6 +72,7 @@ from omnibench.fit.noise import common_poses, grouped, roots_of, whiteners
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.physical import INTERVAL
 from omnibench.words import plural
 
 # Share of a command's median duration that a run must last: a shorter one would cut all others (chosen).
@@ -410,7 +411,7 @@ def _differences(data: SessionScores) -> Iterator[SessionDifference]:
         total, scatter, freedom = contrast.scatter(roots)
         change, inverse = roots @ total, np.linalg.pinv(directions)
         values, deviations = inverse @ change, np.sqrt(np.diag(inverse @ roots @ scatter @ roots.T @ inverse.T))
-        reach = float(stdtrit(freedom, (1 + trajectory_fit.INTERVAL) / 2)) * deviations
+        reach = float(stdtrit(freedom, (1 + INTERVAL) / 2)) * deviations
         count = contrast.sessions.count(session)
         share = count / len(contrast.sessions)
         radii = []

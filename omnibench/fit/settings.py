@@ -14,7 +14,7 @@ from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.prior import MountChoice
-from omnibench.fit.span import Unidentified
+from omnibench.fit.span import Treatment, Unidentified
 from omnibench.robot.odometry import Integration
 
 SteeringChoice = Literal["known", "fit"]
@@ -42,8 +42,8 @@ class FitSettings(Model):
 
     calibrator: str | None = Field(
         None,
-        description="How to search; omnibench list names all. Default: closed_form; trajectory_ml, of runs without "
-        "poses.",
+        description="How to fit; omnibench list names all. Default: map, the most probable model given the references "
+        "and the design.",
     )
     options: dict[str, Any] = Field({}, description="Options of the calibrator.")
     cost: CostChoice | None = Field(
@@ -65,21 +65,21 @@ class FitSettings(Model):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(1, description="Seed of the random numbers.")
     budget: Budget = Budget()
     intervals: bool = Field(
-        False, description="Also draw 95 % intervals of the matrix by resampling (closed_form only)."
+        False, description="Has no effect any more: 95 % intervals are always stated where the data have them."
     )
     unidentified: Unidentified | None = Field(
         None,
-        description="What the data hardly tell: keep the design where motions are hardly driven, fit it all the same, "
-        "or shrink all to the design in proportion to what is known. Default: shrink where wheels say a type but omni.",
+        description="What the data hardly tell, of calibrators that do not weigh the design as map does: keep the "
+        "design where motions are hardly driven (default), or fit it all the same.",
     )
     tolerance: Positive | None = Field(
-        None, description="Of the design, for shrink: share of each row's largest element. Default: by class."
+        None, description="Of the design, for map: share of each row's largest element. Default: by class."
     )
     mount: MountChoice | None = Field(
         None, description="fit: where the tracked point stands. Default: known, but for tricycles and cars."
     )
     steering: SteeringChoice = Field(
-        "known", description="fit: first find its gain, play and coupling, and a car's zero."
+        "known", description="fit: also find its gain, play and coupling, or a car's zero."
     )
 
     @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice | None)
@@ -94,7 +94,7 @@ class CompleteSettings(FitSettings):
     calibrator: str
     cost: CostChoice
     parameterisation: ParameterisationName
-    unidentified: Unidentified
+    unidentified: Treatment  # type: ignore[assignment]
 
     @property
     def objective(self) -> str:

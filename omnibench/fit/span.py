@@ -13,7 +13,9 @@ from omnibench.data.dataset import Trajectory
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot
 
-Unidentified = Literal["keep", "fit", "shrink"]
+Unidentified = Literal["keep", "fit", "shrink"]  # what is asked for; shrink is what map does
+# What an answer does along motions that the data hardly tell; weigh: it weighs the data against the design.
+Treatment = Literal["keep", "fit", "weigh"]
 State = Literal["driven", "weak", "undriven"]
 
 # Share of the strongest direction below which a direction holds noise and no motion. Half of it changes nothing; with
@@ -87,12 +89,14 @@ def driven_span(trajectories: Sequence[Trajectory]) -> DrivenSpan:
     return DrivenSpan(directions[:rank], _signed(directions[rank:]), shares)
 
 
-def directions_kept(robot: Robot, span: DrivenSpan, unidentified: Unidentified) -> Array:
+def directions_kept(robot: Robot, span: DrivenSpan, treatment: Treatment) -> Array:
     """Directions (q, N), orthonormal, along which a calibration keeps the design values.
 
-    unidentified: ``fit`` keeps them along undriven directions only, the others along weak ones too.
+    treatment: ``keep`` does so along weak and undriven directions, ``fit`` along undriven ones, ``weigh`` along none.
     """
-    if unidentified == "fit" or len(span.weak) == 0:
+    if treatment == "weigh":
+        return np.zeros((0, span.null.shape[1]))
+    if treatment == "fit" or len(span.weak) == 0:
         return span.null
     return unidentified_directions(robot, span)
 

@@ -57,18 +57,9 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, rotation
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog, split_by
-from omnibench.robot.physical import INTERVAL as INTERVAL
-from omnibench.robot.physical import MANY as MANY
-from omnibench.robot.physical import EstimatedCovariance as EstimatedCovariance
 from omnibench.robot.stored_odometry import of_runs, poses_of_runs
 
 Stamps = Literal["reference", "final"]
-_ROUNDING = 1e-12  # share of the largest derivative: a smaller one is rounding
-
-
-def depending(slopes: Array, inputs: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which functions (q,) with derivatives (q, n) depend on one of the n inputs that are marked."""
-    return np.asarray((np.abs(slopes[:, inputs]) > _ROUNDING * np.abs(slopes).max()).any(axis=1))
 
 
 def noise_of_matrix(

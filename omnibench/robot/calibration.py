@@ -145,8 +145,8 @@ class Provenance(config.Model):
         None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=_is_none
     )
     box: str
-    unidentified: Literal["keep", "fit", "shrink"] = Field("keep", description="what the data hardly tell")
-    tolerance: float | None = Field(None, description="of the design, for shrink; None: that of the robot's class")
+    unidentified: Literal["keep", "fit", "shrink", "weigh"] = Field("keep", description="what the data hardly tell")
+    tolerance: float | None = Field(None, description="of the design, for map; None: that of the robot's class")
     mount: Literal["known", "fit"] | None = Field(None, description="tracked point of a robot that cannot slide")
     unshrunk_cost: float | None = Field(None, description="training cost before it was shrunk to the design")
     on_bounds: tuple[str, ...] = Field((), description="fitted numbers on a bound of the box")
@@ -225,7 +225,7 @@ class Calibration(Shown, config.Model):
     )
     plain: tuple[Row, Row, Row] | None = Field(
         None,
-        description="matrix without effects, to which these fade beyond such motions as far as they are not sure",
+        description="matrix without effects; these fade to it beyond driven motions, as far as they are not sure",
         exclude_if=_is_none,
     )
     provenance: Provenance | None = None
@@ -261,8 +261,6 @@ class Calibration(Shown, config.Model):
                 raise ValueError(
                     "covariance is not positive semi-definite: it has a negative variance in some direction"
                 )
-        if self.plain is not None and not (self.covariance and self.driven):
-            raise ValueError("plain is the matrix to which effects fade; for that, covariance and driven are needed")
         return self
 
     @model_serializer(mode="wrap")

@@ -54,6 +54,7 @@ _TOLERANCES: Mapping[RobotClass, PhysicalTolerance] = MappingProxyType(
 )
 STEERING_ZERO = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
 TRACKED_POINT = 0.05  # m: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
+TURNING_CENTRE = 0.05  # m: the point about which a skid-steered base turns, by load and ground
 TRACKED_YAW = 0.035  # rad, of a tracker's direction
 
 

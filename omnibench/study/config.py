@@ -13,7 +13,7 @@ from omnibench.config import Model, NonNegative, Positive, RelativePath, printab
 from omnibench.data.splits import Names
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box
-from omnibench.fit.prior import MountChoice, default_cost, default_unidentified
+from omnibench.fit.prior import MountChoice, default_cost
 from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.job import TlsFiles
@@ -188,7 +188,7 @@ class StudyConfig(NamedConfig):
             integration=self.integration,
             seed=seed,
             budget=self.budget,
-            unidentified=method.unidentified or default_unidentified(robot),
+            unidentified=method.unidentified or "keep",
             tolerance=method.tolerance,
             mount=method.mount,
         )

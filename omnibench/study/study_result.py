@@ -50,9 +50,9 @@ from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
 from omnibench.environment import Environment
 from omnibench.fit.ratio_intervals import FEWEST, Interval
-from omnibench.fit.trajectory_fit import INTERVAL
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
+from omnibench.robot.physical import INTERVAL
 from omnibench.study.config import StudyConfig
 from omnibench.study.study_plan import AS_RECORDED, Fold, JudgedFit, PlannedFit, StudiedRobot, Training
 from omnibench.views import Shown

@@ -1,7 +1,6 @@
-"""Calibrations of data sets: omnidirectional and wheeled robots, several sessions, and shrinkage."""
+"""Calibrations of data sets: omnidirectional and wheeled robots, and several sessions."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,10 @@ from corelli import corelli_dataset, half
 from fit_samples import Worst, design_of, noisy_trajectories
 from hidden.session_sets import session_set
 from lanes import slow, slow_cases
-from motions import FLOWER, RING, TURNS, driven
+from motions import RING, driven
 from real_recordings import mean_errors
 from report_page import on_terminal
-from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, TRICYCLE, WHEELED
-from shrink_coverage import ANSWERS, covered
+from sample_robots import CAR, DIFFERENTIAL, TRICYCLE, WHEELED
 from wheeled_recordings import PERIOD, path, recorded
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
@@ -26,15 +24,12 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, DataError, UnknownNameError
-from omnibench.fit.calibrate import CalibrationRun, SteeringFit, calibrate
+from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.calibrator import Outcome, calibration_of_fit
-from omnibench.fit.certify import certify_optimum
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.prior import TOLERANCES, default_mount, default_unidentified, prior_root, tolerance_of
 from omnibench.fit.problem import Budget
 from omnibench.fit.sessions import SessionComparison, compare_sessions
-from omnibench.fit.settings import CompleteSettings
 from omnibench.progress import Progress
 from omnibench.registry import costs
 from omnibench.robot.calibration import read_calibration, write_calibration
@@ -127,20 +122,6 @@ def test_parametric_searches_the_geometry_without_being_told_and_any_search_can(
     np.testing.assert_array_equal(run.result.vector[6:], [wheel.angle for wheel in ROBOT.wheels])
     other = calibrate(dataset, "crs", parameterisation="geometry", budget=Budget(evaluations=300))
     assert other.result.vector[0] == pytest.approx(0.148, rel=0.1)
-
-
-def test_many_runs_of_two_commands_have_no_resampled_intervals_and_it_is_said(dataset: Dataset) -> None:
-    runs = dataset.split("train")
-    two, three = ([replace(run, command=f"{k % commands}") for k, run in enumerate(runs)] for commands in (2, 3))
-    run = calibrate(make_dataset("two", ROBOT, 0.2, two), intervals=True)
-    assert run.intervals is None
-    assert any("2 commands" in warning for warning in run.warnings)
-    found = calibrate(make_dataset("three", ROBOT, 0.2, three), intervals=True)
-    assert found.intervals is not None
-    assert found.units.words == "Student's t over 3 commands"
-    assert calibrate(dataset).intervals is None
-    exact = calibrate(make_dataset("few", ROBOT, 0.2, runs[:2]), intervals=True)
-    assert (exact.uncertainty, exact.intervals) == (None, None)
 
 
 def test_noise_and_covariance_are_written_with_a_calibration_that_was_fitted(dataset: Dataset) -> None:
@@ -335,10 +316,6 @@ def weaving(coupling: float) -> Dataset:
     return make_dataset("weaving", TRICYCLE, PERIOD, runs, simulated=True)
 
 
-# What the search for a steering fits.
-MATRIX = {"calibrator": "closed_form", "parameterisation": "matrix", "unidentified": "keep"}
-
-
 def fitted(run: CalibrationRun) -> dict[str, float]:
     return {name: value for term in run.calibration.effects for name, value in term.parameters.items()}
 
@@ -365,31 +342,6 @@ def test_a_steering_that_turns_its_wheel_along_is_found_and_no_bound_is_warned_o
     run = calibrate(weaving(0.4), cost="trajectory", steering="fit")
     assert fitted(run)["k"] == pytest.approx(0.4, abs=0.02)
     assert not any("lies on the bound" in warning for warning in run.warnings)
-
-
-@pytest.mark.slow
-def test_a_coupling_beyond_what_is_searched_is_warned_of() -> None:
-    beyond = 1.2 / float(TRICYCLE.radii[0])
-    run = calibrate(weaving(beyond), cost="trajectory", steering="fit")
-    assert fitted(run)["k"] == pytest.approx(beyond / 1.5)
-    (warning,) = [each for each in run.warnings if "lies on the bound" in each]
-    assert f"steering coupling {beyond / 1.5:.3g}" in warning
-
-
-@pytest.mark.parametrize("cost", ["trajectory", "final_pose"])
-@pytest.mark.parametrize("jumped", [(), (1, 4)])
-def test_slopes_of_a_search_are_those_of_its_cost_where_starts_jumped_too(cost: str, jumped: tuple[int, ...]) -> None:
-    runs = list(weaving(0.4).trajectories)
-    for place in jumped:
-        poses = runs[place].poses.copy()
-        poses[0] += [0.6, -0.8, 0.3]
-        runs[place] = replace(runs[place], poses=poses)
-    fit = SteeringFit(TRICYCLE, tuple(runs), PERIOD, CompleteSettings(cost=cost, loss="huber", **MATRIX))
-    vector, step = np.array([0.5, 0.1, 0.2]), 1e-3
-    around = [(fit.cost(vector + moved)[0], fit.cost(vector - moved)[0]) for moved in step * np.eye(3)]
-    expected = [(above - below) / (2 * step) for above, below in around]
-    slopes = fit.cost(vector)[1]
-    np.testing.assert_allclose(slopes, expected, rtol=0, atol=2e-3 * np.abs(expected).max())
 
 
 def test_a_steering_is_fitted_by_pose_errors_of_a_robot_that_steers() -> None:
@@ -577,132 +529,3 @@ def test_evaluate_and_compare_say_after_their_verdict_that_the_sessions_differ(c
     told = command("compare", "compare.yaml", "-o", "results")
     assert WORDS in told.stdout, told.stderr
     assert WORDS in Path("results/report.html").read_text()
-
-
-# Shrinkage of a calibration to the design.
-
-OMNI = synthetic_robot(3)
-DESIGN = OMNI.inverse_kinematic_matrix
-
-
-def flower_of(runs: Sequence[Trajectory]) -> Dataset:
-    return make_dataset("flower", OMNI, 0.1, runs, simulated=True)
-
-
-RECORDING = flower_of(driven(FLOWER + TURNS, noise=0.01))
-
-
-def shrunk(tolerance: float | None = None, **choices: Any) -> CalibrationRun:
-    return calibrate(RECORDING, unidentified="shrink", tolerance=tolerance, **choices)
-
-
-def distance(matrix: Array) -> float:
-    """Distance from the design, in the rows' largest elements."""
-    return float(np.linalg.norm((matrix - DESIGN) / OMNI.row_scales[:, None]))
-
-
-def test_the_better_the_design_is_known_the_closer_to_it_is_the_answer() -> None:
-    kept = calibrate(RECORDING, unidentified="keep").calibration.matrix_array
-    np.testing.assert_allclose(shrunk(1e3).calibration.matrix_array, kept, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(shrunk(1e-9).calibration.matrix_array, DESIGN, rtol=0, atol=1e-9)
-    distances = [distance(shrunk(tolerance).calibration.matrix_array) for tolerance in (0.001, 0.003, 0.01, 0.03)]
-    assert distances == sorted(distances)
-    assert shrunk(0.001, calibrator="theoretical").result.shrinkage is None  # which is not fitted
-
-
-def test_the_posterior_weighs_design_and_data_by_their_variances() -> None:
-    """Where covariances commute, by the textbook: each direction by its own variances."""
-    free = calibrate(RECORDING, unidentified="keep")
-    prior = np.diag(np.repeat(0.01 * OMNI.row_scales, 3) ** 2)
-    of_data = free.uncertainty.covariance
-    gain = prior @ np.linalg.inv(prior + of_data)
-    expected = DESIGN.ravel() + gain @ (free.calibration.matrix_array - DESIGN).ravel()
-    run = shrunk(0.01)
-    np.testing.assert_allclose(run.calibration.matrix_array.ravel(), expected, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(run.uncertainty.covariance, prior - gain @ prior, rtol=1e-5, atol=1e-12)
-
-
-def test_a_posterior_variance_has_the_degrees_of_freedom_of_the_part_that_the_data_estimate() -> None:
-    """Satterthwaite: 2 E^2 / Var of a sum of an exact part and one, w, whose variance is 2 w^2 / f."""
-    free, shrunk_little, run = calibrate(RECORDING, unidentified="keep"), shrunk(1e3), shrunk(0.01)
-    posterior = run.uncertainty.covariance
-    of_data = np.diag(posterior @ np.linalg.solve(free.uncertainty.covariance, posterior))
-    variance_of_estimate = 2 * of_data**2 / shrunk_little.result.degrees_of_freedom
-    expected = 2 * np.diag(posterior) ** 2 / variance_of_estimate
-    assert (of_data < 0.9 * np.diag(posterior)).any()
-    np.testing.assert_allclose(run.result.degrees_of_freedom, expected, rtol=1e-3)
-
-
-def test_the_cost_of_shrinking_is_said_and_certified() -> None:
-    run = shrunk(0.003)
-    origin = run.calibration.provenance
-    assert (origin.unidentified, origin.tolerance) == ("shrink", 0.003)
-    certificate = certify_optimum(run.calibration, RECORDING, gap=0.01).certificate
-    assert certificate.gap < 0.01
-    assert certificate.shrinking == pytest.approx(origin.training_cost / origin.unshrunk_cost - 1, rel=1e-6)
-    assert "shrunk to the design, which changes the cost by +" in origin.reason
-
-
-def test_a_fit_without_any_error_is_shrunk_and_certified_all_the_same() -> None:
-    """A single final pose, which a matrix meets to the last bit."""
-    (run, *_) = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(3))
-    dataset = make_dataset("tricycle", TRICYCLE, PERIOD, [run], simulated=True)
-    calibration = calibrate(dataset, cost="final_pose", unidentified="shrink").calibration
-    assert calibration.provenance.unshrunk_cost < 1e-9
-    certificate = certify_optimum(calibration, dataset, seconds=1.0).certificate
-    assert certificate.cost == calibration.provenance.training_cost
-    assert certificate.shrinking is None
-
-
-def test_a_motion_that_is_not_driven_keeps_the_design() -> None:
-    """Runs without turns say nothing of turning."""
-    straight = flower_of(driven([(0.2, 0.0, 0.0), (0.0, 0.2, 0.0)]))
-    run = calibrate(straight, unidentified="shrink")
-    turning = OMNI.signal_equations @ [0.0, 0.0, 1.0]
-    np.testing.assert_allclose(run.calibration.matrix_array @ turning, DESIGN @ turning, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_search_is_shrunk_like_the_optimum() -> None:
-    searched = shrunk(0.01, calibrator="crs").calibration.matrix_array
-    np.testing.assert_allclose(searched, shrunk(0.01).calibration.matrix_array, rtol=0, atol=1e-5)
-
-
-def test_robots_whose_wheels_say_their_type_are_shrunk_and_a_tricycle_s_tracked_point_is_fitted_by_default() -> None:
-    assert [default_unidentified(robot) for robot in (APR_02, MECANUM, DIFFERENTIAL)] == ["keep", "shrink", "shrink"]
-    wheels = tuple(wheel.model_copy(update={"type": "omni"}) for wheel in APR_02.wheels)
-    assert default_unidentified(APR_02.model_copy(update={"wheels": wheels})) == "keep"
-    assert [default_mount(robot) for robot in (DIFFERENTIAL, TRICYCLE)] == ["known", "fit"]
-
-
-def test_the_prior_has_the_stated_widths() -> None:
-    root = prior_root(SKID, tolerance_of(SKID))
-    deviations = np.sqrt(np.diag(root @ root.T)).reshape(3, -1) / SKID.row_scales[:, None]
-    elements, rows, centre = TOLERANCES["skid"].elements, TOLERANCES["skid"].rows, TOLERANCES["skid"].centre
-    turning = SKID.inverse_kinematic_matrix[2]
-    aside = centre * turning / SKID.row_scales[:2, None]
-    np.testing.assert_allclose(deviations[0], np.sqrt(elements**2 + rows[0] ** 2 + aside[0] ** 2), rtol=1e-9)
-    np.testing.assert_allclose(deviations[1], np.sqrt(elements**2 + aside[1] ** 2), rtol=1e-9)  # zeros have no factor
-    np.testing.assert_allclose(deviations[2], np.hypot(elements, rows[2]), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_centre_of_turning_that_is_not_in_the_middle_leaves_a_skid_base_its_turn() -> None:
-    """2 cm off, as the mass of a skid-steered base moves it; a prior that knew it to 1.5 mm bent the turn by 0.5 %."""
-    turns = [[covered("skid", answer, seed, repetitions=1).errors[2] for answer in ANSWERS] for seed in range(1, 4)]
-    assert np.abs(np.diff(np.array(turns), axis=1)).max() < 0.0015
-
-
-def test_intervals_of_shrunk_answers_hold_the_truth_of_skid_bases() -> None:
-    """Rows y and turn of five bases; 30 % held it when the centre of turning counted as known."""
-    rows = [covered("skid", "shrink", seed, repetitions=1, slip=5.0) for seed in range(5)]
-    ratios = np.array([row.elements[1:] for row in rows])
-    assert np.mean(ratios <= 1) > 0.8
-
-
-@pytest.mark.parametrize(
-    "choices", [{"unidentified": "shrink", "intervals": True}, {"unidentified": "keep", "tolerance": 0.01}]
-)
-def test_resampled_intervals_of_shrunk_answers_and_a_tolerance_without_shrinkage_are_refused(choices: Any) -> None:
-    with pytest.raises(ConfigError, match="unidentified"):
-        calibrate(RECORDING, **choices)

@@ -11,6 +11,7 @@ import pytest
 import reference_coverage as study
 from fit_samples import noisy_trajectories
 from lanes import slow
+from omnibench.fit.reference_fit import ReferenceFit, covariance_root
 from sample_robots import APR_02
 
 import omnibench.robot.stored_odometry as odometry_of_stored
@@ -25,7 +26,6 @@ from omnibench.fit.evaluate import ModelErrors, evaluate, final_errors, judge, v
 from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.motion_windows import MotionWindows, motions_in_windows
 from omnibench.fit.problem import Budget
-from omnibench.fit.reference_fit import ReferenceFit, covariance_root
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.robot.calibration import Calibration, EffectTerm, HeldOutVerdict, matrix_rows
 from omnibench.robot.kinematics import Array, Robot

@@ -19,7 +19,7 @@ from scipy import stats
 
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.fit.trajectory_fit import EstimatedCovariance
+from omnibench.robot.physical import EstimatedCovariance
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel

@@ -1,15 +1,14 @@
 """Coverage of the 95 % intervals of calibrations from distances, angles, displacements, positions and headings.
 
     python tests/studies/reference_coverage.py --out coverage.jsonl --sets 300 [--kinds distance turn] [--table]
-    python tests/studies/reference_coverage.py --out shrunk.jsonl --sets 100 --robots diff --unidentified shrink
+    python tests/studies/reference_coverage.py --out closed_form.jsonl --sets 100 --calibrator closed_form
 
 One line of JSON a set, added as it comes: run again with the same file, and it goes on where it was. With --table the
 table is printed from what is there.
 
 Robots are simulated with exact poses, of which this file makes the references: it shares nothing with what fits them.
-Their matrices are off the design by 2 % of a row's largest element, or, where answers are shrunk, drawn from the
-design's tolerance, of which shrinkage knows. Counted are the elements that have an interval, and, of the combinations
-that the references tell, those that are independent in the covariance.
+Their matrices are drawn from the tolerance of the design, of which map knows. Counted are the elements that have an
+interval, and combinations that are independent in the covariance: those that the references tell, and of map's all.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.open_combinations import WORST
-from omnibench.fit.prior import prior_root, tolerance_of
-from omnibench.fit.span import Unidentified
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.processes import one_thread
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Robot
@@ -41,7 +39,6 @@ from omnibench.simulate.source import read_simulation, simulate_dataset
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 TAPE, ANGLE, GPS, COMPASS = 0.003, 0.01, 0.02, 0.03  # m, rad, m, rad: standard deviations of what is measured
-OFF = 0.02  # share of a row's largest element by which the true elements are off the design
 EVERY = 1.0  # s between positions and headings
 
 
@@ -130,28 +127,21 @@ def _reduced(run: Trajectory, kind: str, rng: np.random.Generator) -> Trajectory
 
 
 @lru_cache(maxsize=4)
-def simulated(robot: str, seed: int, encoder: float = 0.02, tolerance: bool = False) -> tuple[Dataset, np.ndarray]:
-    """A simulated data set with exact poses, and the robot's true matrix. encoder: noise of each wheel rate, rad/s.
-
-    tolerance: the matrix is drawn from the tolerance of the robot's design.
-    """
+def simulated(robot: str, seed: int, encoder: float = 0.02) -> tuple[Dataset, np.ndarray]:
+    """A simulated data set with exact poses, and the robot's true matrix. encoder: noise of each wheel rate, rad/s."""
     name, changes, length = ROBOTS[robot]
     flower = read_simulation(CONFIGS / f"{name}.yaml").config
     assert isinstance(flower, FlowerConfig)
     train = flower.train.model_copy(update={"seed": 30_000 + seed, "noise_scale": 0.0, "distance": length})
-    truth = Truth(matrix=matrix_rows(_true_matrix(flower.robot, np.random.default_rng([seed, 7]), tolerance)))
+    truth = Truth(matrix=matrix_rows(_true_matrix(flower.robot, np.random.default_rng([seed, 7]))))
     noise = flower.noise.model_copy(update={"encoder": encoder})
     made = simulate_dataset(flower.model_copy(update={**changes, "train": train, "truth": truth, "noise": noise}))
     return made.dataset, np.array(made.truth.matrix)
 
 
-def _true_matrix(robot: Robot, rng: np.random.Generator, tolerance: bool) -> np.ndarray:
-    design = robot.inverse_kinematic_matrix
-    if tolerance:
-        root = prior_root(robot, tolerance_of(robot))
-        off = (root @ rng.normal(size=root.shape[1])).reshape(design.shape)
-    else:
-        off = OFF * rng.normal(size=design.shape) * robot.row_scales[:, None]
+def _true_matrix(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+    design, root = robot.inverse_kinematic_matrix, physical_prior_root(robot, physical_tolerance(robot))
+    off = (root @ rng.normal(size=root.shape[1])).reshape(design.shape)
     off[1] *= bool(design[1].any())  # a robot on two fixed wheels does not slide
     moved: np.ndarray = design + off
     return moved
@@ -163,11 +153,10 @@ class Case:
 
     robot: str
     kind: str
-    calibrator: str = "trajectory_ml"
-    unidentified: Unidentified = "keep"
+    calibrator: str = "map"
 
     def __str__(self) -> str:
-        return f"{self.robot}, {self.kind}, {self.calibrator}, {self.unidentified}"
+        return f"{self.robot}, {self.kind}, {self.calibrator}"
 
 
 @dataclass(frozen=True)
@@ -187,10 +176,9 @@ class Row:
 
 def covered(case: Case, seed: int) -> Row:
     """Calibrate one simulated set of references and compare it with its truth."""
-    shrinks = case.unidentified == "shrink"
-    exact, truth = simulated(case.robot, seed, tolerance=shrinks)
+    exact, truth = simulated(case.robot, seed)
     dataset = reduced(exact, case.kind, np.random.default_rng([seed, *case.kind.encode()]))
-    run = calibrate(dataset, case.calibrator, unidentified=case.unidentified, seed=seed)
+    run = calibrate(dataset, case.calibrator, seed=seed)
     if (found := run.uncertainty) is None:
         return Row(str(case), seed, (), (), (), "; ".join(run.warnings))
     reach, spread = ((found.intervals.high - found.intervals.low) / 2).ravel(), found.standard_deviations.ravel()
@@ -198,7 +186,7 @@ def covered(case: Case, seed: int) -> Row:
     told = ~np.isnan(reach) & (spread > 0)  # a robot that cannot slide has elements that are 0
     units = np.repeat(dataset.robot.row_scales, truth.shape[1])
     values, vectors = np.linalg.eigh(found.covariance / np.outer(units, units))
-    known = (values > 1e-9 * values.max()) & ((values < WORST**2) | shrinks)
+    known = (values > 1e-9 * values.max()) & ((values < WORST**2) | (case.calibrator == "map"))
     away = (vectors.T @ (off / units))[known] / np.sqrt(values[known])
     quantiles = np.where(told, reach / np.where(spread > 0, spread, 1.0), 0.0)
     shares = np.square(vectors.T[known] * (spread / units)) * told  # of the elements in a combination
@@ -265,16 +253,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first set")
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--robots", nargs="*", default=list(ROBOTS))
-    parser.add_argument("--calibrator", default="trajectory_ml")
-    parser.add_argument("--unidentified", default="keep")
+    parser.add_argument("--calibrator", default="map")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
-    cases = [
-        Case(robot, kind, arguments.calibrator, arguments.unidentified)
-        for robot in arguments.robots
-        for kind in arguments.kinds
-    ]
+    cases = [Case(robot, kind, arguments.calibrator) for robot in arguments.robots for kind in arguments.kinds]
     rows = read_rows(arguments.out)
     if not arguments.table:
         done = {(row.case, row.seed) for row in rows}

@@ -49,7 +49,7 @@ def _smoothed(run: Trajectory) -> Trajectory:
 def apart(dataset: Dataset, kind: str, full: CalibrationRun, chords: bool) -> np.ndarray:
     """Distances of the reduced fit from the full one, element by element, over the sum of both intervals' reaches."""
     source = dataset if chords or "distance" not in kind else smoothed(dataset)
-    part = calibrate(reduced(source, kind, np.random.default_rng(1)), unidentified="keep")
+    part = calibrate(reduced(source, kind, np.random.default_rng(1)))
     away = np.abs(full.calibration.matrix_array - part.calibration.matrix_array) / (_reach(full) + _reach(part))
     return away[np.isfinite(away)]
 
@@ -70,7 +70,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for robot in arguments.robots:
         dataset = import_dataset("optiodom", f"{DATA}/{ROBOTS[robot]}")
-        full = calibrate(dataset, "trajectory_ml", unidentified="keep", options={"clock": arguments.clocks})
+        full = calibrate(dataset, "map", options={"clock": arguments.clocks})
         for kind in arguments.kinds:
             away = apart(dataset, kind, full, arguments.chords)
             print(

@@ -40,7 +40,7 @@ from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 
-CALIBRATORS = ("least_squares", "closed_form", "trajectory_ml", "crs")
+CALIBRATORS = ("least_squares", "closed_form", "map", "crs")
 LOSSES: tuple[LossName, ...] = ("squares", "huber", "student_t")
 DIFF = make_robot("diff", *(fixed(name, 0, y, radius=0.042) for name, y in (("right", -0.1), ("left", 0.1))))
 TRICYCLE = make_robot(

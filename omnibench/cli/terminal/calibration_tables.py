@@ -14,11 +14,12 @@ from rich.console import Console, RenderableType
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import ConfigError
-from omnibench.fit.bootstrap import ElementIntervals
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.calibration_report import parameter_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
@@ -28,7 +29,6 @@ from omnibench.words import plural
 
 _NONE = "no interval"
 _NO_BREAK = "\u00a0"
-_HEADING = 24  # columns: a longer title stands above its table; chosen
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
 _ROWS = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen
@@ -45,8 +45,11 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
         console.print(f"cost of the calibration      {certificate.cost:.9f}")
     else:
         console.print(f"cost of the calibration      {certificate.cost * (1 + certificate.shrinking):.9f}")
-        console.print(f"cost before it was shrunk    {certificate.cost:.9f}")
-        console.print(f"Shrinking it to the design adds {certificate.shrinking:.2%} to the cost.", soft_wrap=True)
+        console.print(f"optimum of the matrix alone  {certificate.cost:.9f}")
+        console.print(
+            f"The calibration weighs the design, or has effects: its cost differs by {certificate.shrinking:+.2%}.",
+            soft_wrap=True,
+        )
     if proof.best_cost < certificate.cost:
         console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
     console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
@@ -73,15 +76,13 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
     """
     lines = [f"{run.result.outcome}: {run.result.reason}; {plural(run.result.evaluations, 'evaluation')}"]
     lines[0] += f", {run.result.seconds:.2f} s"
-    if run.intervals is not None:
-        lines.append(f"95 % intervals, resampled: {run.units.words}")
     if run.uncertainty is not None:
         lines.insert(0, f"95 % intervals: {run.uncertainty.source}")
         if run.calibration.noise is not None:
             lines.append(f"noise of the reference: {'; '.join(noise_in_words(run.calibration.noise))}")
     room = _SCREEN - _height(console, *others)
     if run.parameters:
-        parameters = render_table(_parameter_table(run), console.width)
+        parameters = render_table(parameter_table(run.calibration, _title(run)), console.width)
         console.print(parameters)
         room -= _height(console, parameters)
 
@@ -95,7 +96,7 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
     forms.append(f"matrix (3 x {len(run.calibration.matrix[0])}): not on this screen; --json shows it, -o writes it")
     heights = [_height(console, forms[0], *lines), *(_height(console, form) for form in forms[1:])]
     fitting = [form for form, height in zip(forms, heights, strict=True) if height <= room]
-    matrix = forms[0] if run.intervals is not None else next(iter(fitting), forms[-1])
+    matrix = next(iter(fitting), forms[-1])
     console.print(matrix, soft_wrap=isinstance(matrix, str))
     room -= _height(console, matrix)
     for line in lines:
@@ -122,25 +123,6 @@ def _height(console: Console, *shown: RenderableType) -> int:
     return sum(tables) + sum(-(-max(len(line), 1) // width) for text in texts for line in text)
 
 
-def _parameter_table(run: CalibrationRun) -> Table:
-    """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
-    rows = []
-    for each in run.parameters:
-        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
-            each.unit, (1.0, 5, each.unit)
-        )
-        percent = None if each.unit == "rad" else each.deviation_percent
-        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if percent is None else f"{percent:+.2f} %"
-        ends = [] if each.low is None or each.high is None else [each.low, each.high]
-        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or _NONE
-        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append(Row.of(each.name, *values, unit, change, interval))
-    headings = (Column("design"), Column("value"), Column("", numeric=False), Column("change"), Column("95 %"))
-    title = _title(run)
-    caption, first = ("", title.replace(" ", _NO_BREAK)) if len(title) <= _HEADING else (title, "parameter")
-    return Table(caption, (Column(first, numeric=False), *headings), tuple(rows))
-
-
 def _title(run: CalibrationRun) -> str:
     provenance = run.calibration.provenance
     return f"{run.calibration.name}{' (simulated data)' if provenance is not None and provenance.simulated else ''}"
@@ -157,8 +139,6 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
     notes, listed = [], list[tuple[str, ElementIntervals]]()
     if run.uncertainty is not None and intervals:
         listed.append(("95 %", run.uncertainty.intervals))
-    if run.intervals is not None:
-        listed.append(("95 %, resampled", run.intervals))
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"

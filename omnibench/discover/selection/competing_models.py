@@ -59,10 +59,11 @@ from omnibench.discover.regressors.significance import Group, best_shapes
 from omnibench.discover.result import Absorbed, Candidate, EstimatedParameter, Hidden, NamedEffect
 from omnibench.discover.selection.evidence import Missing
 from omnibench.discover.selection.model_selection import ABSORBED, SURE, MotorEffects, Screening, Selection
-from omnibench.fit.trajectory_fit import EstimatedCovariance, Given, given
+from omnibench.fit.trajectory_fit import Given, given
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import form_in_words
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.physical import EstimatedCovariance
 
 _ALIKE = 0.95  # a, Eq. (1), of one class: log odds of at most 2.5, Eq. (2), a weight below that of a sure name
 _SUM = 0.98  # a, Eq. (1), of several effects that imitate one: log odds of at most 1, Eq. (2)

@@ -52,9 +52,10 @@ from omnibench.discover.regressors.significance import ColumnStore, Group, Signi
 from omnibench.discover.selection import evidence as odds
 from omnibench.discover.selection.evidence import Groups, catalogue, make_groups
 from omnibench.fit.noise import grouped
-from omnibench.fit.trajectory_fit import EstimatedCovariance, Given, Whitened, given
+from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.robot.effects.effect import ActuatorEffect, Parameter
 from omnibench.robot.kinematics import Array, Robot, in_the_middle, rotated
+from omnibench.robot.physical import EstimatedCovariance
 
 # tests/studies/constants.py varies each number by 0.5 and 2: on a small set with motor lag no verdict and no name
 # changes.

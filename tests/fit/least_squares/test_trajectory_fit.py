@@ -11,11 +11,11 @@ from fit_samples import make_problem, noisy_trajectories
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from omnibench.fit.calibrators.trajectory_ml import robust_noise
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting import fit_matrix, with_noise
 from omnibench.errors import DataError
-from omnibench.fit.calibrators.trajectory_ml import robust_noise
 from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
 from omnibench.fit.loss import LossName, cost_weightings
 from omnibench.fit.noise import (

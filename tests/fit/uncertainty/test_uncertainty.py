@@ -1,15 +1,12 @@
-"""How sure a calibration is: covariance of the elements and of the geometry behind them, and resampled intervals."""
+"""How sure a calibration is: covariance of the elements and of the geometry behind them, and intervals of ratios."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import improvement_coverage
 import numpy as np
 import pytest
-import uncertainty_coverage
 from fit_samples import make_problem, noisy_trajectories
 from motions import FLOWER, RING, SPEED, TURNS, Twist, driven
 from sample_robots import CAR, DIFFERENTIAL
@@ -17,11 +14,9 @@ from scipy import stats
 from wheeled_samples import driven as curves
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.errors import ConfigError, DataError
-from omnibench.fit.bootstrap import bootstrap_intervals
+from omnibench.errors import DataError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import RunResult, run_calibrator
-from omnibench.fit.calibrators.closed_form import cone_program
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import (
     Identifiability,
@@ -36,16 +31,14 @@ from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.parameterisation import ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem
 from omnibench.fit.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
-from omnibench.fit.sandwich import Scores, sandwich, scores_of_runs
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
-from omnibench.fit.trajectory_fit import EstimatedCovariance, information_of_runs
+from omnibench.fit.trajectory_fit import information_of_runs
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, physical_parameters, uncertainty_of
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 from omnibench.robot.calibration import Noise, matrix_rows
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import OdometryBatch
-from omnibench.robot.physical import PhysicalParameter
-from omnibench.simulate.source import read_simulation, simulate_dataset
+from omnibench.robot.physical import EstimatedCovariance, PhysicalParameter
 from omnibench.testing.synthetic import synthetic_robot, true_robot
 
 ROBOT = synthetic_robot()
@@ -68,16 +61,6 @@ def wheels(problem: CalibrationProblem, calibrator: str = "closed_form") -> tupl
 def found(runs: list[Trajectory], **changes: str) -> Uncertainty:
     problem = make_problem(runs, **changes)
     return uncertainty_of(problem, solved(problem))
-
-
-@cache
-def flower_problem(repetitions: int | None = None) -> tuple[CalibrationProblem, RunResult]:
-    """The flower of the paper's comparison in a box that holds its truth, and its optimum."""
-    flower = read_simulation(uncertainty_coverage.CONFIG).config
-    changes = {"validation": None} | ({} if repetitions is None else {"repetitions": repetitions})
-    dataset = simulate_dataset(flower.model_copy(update=changes)).dataset
-    problem = make_problem(dataset.split("train"), robot=dataset.robot, integration="euler")
-    return problem, solved(problem)
 
 
 def shares(uncertainty: Uncertainty) -> Array:
@@ -104,18 +87,7 @@ def test_the_information_is_that_of_the_residuals_covariance(stamps: str) -> Non
     np.testing.assert_allclose(information, expected, rtol=1e-9, atol=1e-6)
 
 
-# The sandwich of a sum of norms.
-
-
-@pytest.mark.slow
-def test_the_covariance_agrees_with_the_bootstrap_on_the_flower() -> None:
-    problem, result = flower_problem()
-    said = uncertainty_of(problem, result).standard_deviations
-    intervals = bootstrap_intervals(problem, result.vector, resamples=150, rng=np.random.default_rng(0))
-    drawn = (intervals.high - intervals.low) / (2 * 1.96)
-    # Of 150 resamples a 95 % range is uncertain by 8 %; of 180 runs each estimate by as much again.
-    np.testing.assert_allclose(said / drawn, 1, atol=0.2)
-    assert np.mean(said / drawn) == pytest.approx(1, abs=0.1)
+# The scatter of the runs about the minimum of a sum of norms.
 
 
 @pytest.mark.parametrize("cost", ["final_pose", "final_position", "trajectory"])
@@ -137,9 +109,7 @@ def test_an_element_that_the_box_holds_has_no_variance_and_no_interval() -> None
     uncertainty = uncertainty_of(problem, result)
     assert uncertainty.standard_deviations[0, 1] == 0
     assert np.count_nonzero(uncertainty.standard_deviations) == 8
-    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
-    for intervals in (uncertainty.intervals, drawn):
-        assert np.argwhere(np.isnan(intervals.low)).tolist() == [[0, 1]]
+    assert np.argwhere(np.isnan(uncertainty.intervals.low)).tolist() == [[0, 1]]
 
 
 def test_what_depends_on_an_element_on_a_bound_has_no_interval() -> None:
@@ -151,26 +121,11 @@ def test_what_depends_on_an_element_on_a_bound_has_no_interval() -> None:
     problem = make_problem(driven(FLOWER), box=box)
     result = solved(problem)
     assert result.at_bounds == ("m23",)
-    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
     uncertainty = uncertainty_of(problem, result)
-    for intervals in (uncertainty.intervals, drawn):
-        assert np.argwhere(np.isnan(intervals.low)).tolist() == [[1, 2]]
-        assert np.argwhere(np.isnan(intervals.high)).tolist() == [[1, 2]]
+    assert np.argwhere(np.isnan(uncertainty.intervals.low)).tolist() == [[1, 2]]
+    assert np.argwhere(np.isnan(uncertainty.intervals.high)).tolist() == [[1, 2]]
     told = [each.name for each in physical_parameters(problem, result, uncertainty).parameters if each.low is not None]
     assert told == ["distance_c", "angle_c"]  # which m23 of the design does not move
-
-
-def test_resamples_that_a_bound_stops_have_no_interval() -> None:
-    free = solved(make_problem(driven(FLOWER)))
-    wide = np.abs(ROBOT.inverse_kinematic_matrix).max() + np.zeros((3, 3))
-    lower, upper = free.matrix - wide, free.matrix + wide
-    above = free.matrix[0, 0] > ROBOT.inverse_kinematic_matrix[0, 0]
-    (upper if above else lower)[0, 0] = free.matrix[0, 0] + (1e-5 if above else -1e-5)
-    problem = make_problem(driven(FLOWER), box=ExplicitBox(lower=matrix_rows(lower), upper=matrix_rows(upper)))
-    result = solved(problem)
-    assert result.at_bounds == ()
-    drawn = bootstrap_intervals(problem, result.vector, resamples=60, rng=np.random.default_rng(1))
-    assert np.argwhere(np.isnan(drawn.low)).tolist() == [[0, 0]]
 
 
 def test_directions_that_are_kept_have_no_variance_and_their_parameters_none_at_all() -> None:
@@ -197,12 +152,9 @@ def test_a_calibrator_s_own_covariance_and_freedom_are_taken(freedom: Array | No
 # What the covariance rests on, chosen by rule and said in words.
 
 
-def test_repetitions_are_used_where_there_are_some_and_runs_scatter_about_zero_elsewhere() -> None:
-    assert "48 runs of 16 commands" in found(driven(FLOWER)).source
-    once = found(driven(FLOWER, repetitions=1))
-    unnamed = found([replace(run, command=None) for run in driven(FLOWER)])
-    assert "16 runs: no command is repeated" in once.source
-    assert "no command is repeated" in unnamed.source
+def test_an_interval_says_what_it_rests_on() -> None:
+    assert found(driven(FLOWER)).source == "jackknife over 16 commands, of one session alone"
+    assert found(driven(FLOWER, repetitions=1)).source == "jackknife over 16 runs, of one session alone"
 
 
 @pytest.mark.parametrize(
@@ -210,6 +162,7 @@ def test_repetitions_are_used_where_there_are_some_and_runs_scatter_about_zero_e
     [
         (driven(RING[1:3], repetitions=1), "trajectory", "too few"),
         (driven(FLOWER, noise=0.0), "final_pose", "exactly"),
+        (driven(FLOWER[:5], repetitions=1), "final_heading", "exactly through half of the poses"),
         ([replace(run, rates=0 * run.rates) for run in driven(FLOWER)], "final_pose", "free"),
     ],
 )
@@ -239,31 +192,7 @@ def test_both_ways_to_the_geometry_agree() -> None:
         assert one.high - one.low == pytest.approx(other.high - other.low, rel=1e-3)
 
 
-def test_a_resampled_optimum_differs_from_a_full_refit_by_far_less_than_the_intervals_width() -> None:
-    problem, result = flower_problem(repetitions=1)
-    optimum = result.vector
-    intervals = bootstrap_intervals(problem, optimum, resamples=100, rng=np.random.default_rng(0))
-    width = (intervals.high - intervals.low).ravel()
-    drawn = np.random.default_rng(5).multinomial(36, np.full(36, 1 / 36))
-    shares = problem.objective.shares(problem.odometry.trajectory) * drawn
-    linearised = optimum + cone_program(problem, problem.objective, optimum).step(shares)
-    refitted = linearised
-    for _ in range(6):  # each about the last answer: where it no longer moves, the poses are not linearised any more
-        refitted = refitted + cone_program(problem, problem.objective, refitted).step(shares)
-    assert np.abs(linearised - optimum).max() > 0.01 * width.max()
-    assert (np.abs(refitted - linearised) < 0.01 * width).all()
-    more_problem, more_result = flower_problem(repetitions=4)
-    more = bootstrap_intervals(more_problem, more_result.vector, resamples=100, rng=np.random.default_rng(0))
-    assert np.median(more.high - more.low) == pytest.approx(np.median(width) / 2, rel=0.35)
-
-
-def test_the_geometry_has_no_resampled_intervals() -> None:
-    problem = make_problem(parameterisation="geometry")
-    with pytest.raises(ConfigError, match="matrix parameterisation"):
-        bootstrap_intervals(problem, problem.start, rng=np.random.default_rng(0))
-
-
-# Intervals by Student's t, of ratios and of the sandwich: units, coverage, and where there is none.
+# Intervals by Student's t, of functions and of ratios: units, coverage, and where there is none.
 
 MATRIX = np.array([[4.0, 1.0], [1.0, 9.0]])
 
@@ -379,231 +308,6 @@ def test_the_verdict_of_a_calibration_covers_what_its_matrix_improves_on_fresh_c
     found = [improvement_coverage.whole_way(12, seed) for seed in range(12)]
     # Binomial: 95 % of 12 leaves fewer than 9 inside with a probability of 2e-4.
     assert sum(interval.holds(truth) for interval, truth in found) >= 9
-
-
-def runs_of(commands: Sequence[str | None], sessions: Sequence[str | None] | None = None) -> list[Trajectory]:
-    """Runs of one second with a pose at its end, of the commands given."""
-    sessions = sessions or ["s"] * len(commands)
-    times, poses = np.array([1.0]), np.zeros((2, 3))
-    return [
-        Trajectory(str(index), "train", times, np.zeros((1, 3)), np.array([0.0, 1.0]), poses, command, session=session)
-        for index, (command, session) in enumerate(zip(commands, sessions, strict=True))
-    ]
-
-
-def scores_of_a_mean(values: Array, runs: Sequence[Trajectory]) -> Scores:
-    """Scores of the mean (n,) of values (Z, n): the minimiser of sum_i |x_i - m|^2 / 2Z."""
-    count, size = values.shape
-    hessians = np.tile(np.eye(size) / count, (count, 1, 1))
-    return Scores((values.mean(axis=0) - values) / count, hessians, runs, np.zeros(size), hessians)
-
-
-VALUES = np.random.default_rng(3).standard_normal((12, 2)) @ np.array([[1.0, 0.5], [0.0, 2.0]])
-
-
-def test_without_repetitions_a_mean_has_the_sample_covariance_over_the_number_of_runs() -> None:
-    found = sandwich(scores_of_a_mean(VALUES, runs_of([None] * 12)))
-    np.testing.assert_allclose(found.covariance, np.cov(VALUES.T) / 12, rtol=1e-12)
-    np.testing.assert_allclose(found.effective_freedom, 11.0)
-    assert not found.lack_of_fit
-
-
-def test_with_repetitions_a_mean_has_the_scatter_within_its_commands_alone() -> None:
-    apart = VALUES + np.repeat([[0.0, 0.0], [50.0, 0.0], [0.0, 90.0]], 4, axis=0)
-    found = sandwich(scores_of_a_mean(apart, runs_of(["a"] * 4 + ["b"] * 4 + ["c"] * 4)))
-    within = sum(4 * np.cov(VALUES[first : first + 4].T) for first in (0, 4, 8))
-    np.testing.assert_allclose(found.covariance, within / 12**2, rtol=1e-12)
-    np.testing.assert_allclose(found.effective_freedom, 9.0)
-    assert "3 commands are too few" in found.words  # to tell whether they scatter more
-
-
-@pytest.mark.parametrize(
-    ("scatter", "words"), [(0.01, "6 commands"), (0.0, "more than the repetitions, which agree exactly")]
-)
-def test_commands_that_scatter_more_than_their_repetitions_are_the_clusters(scatter: float, words: str) -> None:
-    values = np.repeat([-30.0, -7.0, 2.0, 5.0, 11.0, 19.0], 2)[:, None] + scatter * VALUES[:, :1]
-    found = sandwich(scores_of_a_mean(values, runs_of([name for name in "abcdef" for _ in range(2)])))
-    means = values.reshape(6, 2).mean(axis=1)
-    np.testing.assert_allclose(found.covariance, [[means.var(ddof=1) / 6]], rtol=1e-9)
-    assert found.lack_of_fit
-    assert words in found.words
-
-
-def test_sessions_are_the_clusters_where_they_scatter_most() -> None:
-    drift = np.repeat([-9.0, -2.0, 4.0, 7.0], 6)
-    values = (drift + 0.01 * np.random.default_rng(1).standard_normal(24))[:, None]
-    runs = runs_of(["a", "b", "c"] * 8, [name for name in "stuv" for _ in range(6)])
-    found = sandwich(scores_of_a_mean(values, runs))
-    np.testing.assert_allclose(found.covariance, [[values.reshape(4, 6).mean(axis=1).var(ddof=1) / 4]], rtol=1e-9)
-    assert "4 sessions" in found.words
-
-
-def test_clusters_that_may_scatter_more_count_for_the_interval_and_are_no_lack_of_fit() -> None:
-    """Six means of two: their F ratio of 12 has a chance of 0.4 %."""
-    values = (np.repeat([-2.0, -1.0, 0.0, 0.0, 1.0, 2.0], 2) + np.tile([0.58, -0.58], 6))[:, None]
-    found = sandwich(scores_of_a_mean(values, runs_of([name for name in "abcdef" for _ in range(2)])))
-    np.testing.assert_allclose(found.covariance, [[2.0 / 6]], rtol=1e-9)
-    assert (found.clustered, found.lack_of_fit) == (True, False)
-    assert found.effective_freedom == pytest.approx([5.0])
-
-
-def test_in_no_direction_clusters_make_the_covariance_smaller_than_repetitions_do() -> None:
-    """Commands scatter along x and repetitions along y: the one is taken from commands, the other from repetitions."""
-    centres = np.array([-30.0, -7.0, 2.0, 5.0, 11.0, 19.0])
-    values = np.column_stack([np.repeat(centres, 2), np.tile([3.0, -3.0], 6)]) + 0.01 * VALUES
-    commands = [name for name in "abcdef" for _ in range(2)]
-    covariance = sandwich(scores_of_a_mean(values, runs_of(commands))).covariance
-    within = sum(2 * np.cov(values[first : first + 2].T) for first in range(0, 12, 2)) / 12**2
-    assert np.linalg.eigvalsh(covariance - within).min() > -1e-9
-    np.testing.assert_allclose(np.diag(covariance), [centres.var(ddof=1) / 6, within[1, 1]], rtol=1e-2)
-
-
-def test_a_direction_in_which_the_cost_is_flat_has_no_variance() -> None:
-    flat = np.array([[1.0, 1.0], [1.0, 1.0]]) / 12
-    scores = (VALUES[:, :1].mean() - VALUES[:, :1]) * np.array([[1.0, 1.0]]) / 12
-    hessians = np.tile(flat, (12, 1, 1))
-    found = sandwich(Scores(scores, hessians, runs_of([None] * 12), np.zeros(2), hessians))
-    difference = np.array([1.0, -1.0])
-    assert difference @ found.covariance @ difference == pytest.approx(0.0, abs=1e-15)
-    total = np.array([1.0, 1.0])
-    assert total @ found.covariance @ total == pytest.approx(VALUES[:, 0].var(ddof=1) / 12)
-
-
-def test_commands_repeated_unequally_have_the_degrees_of_freedom_of_welch_and_satterthwaite() -> None:
-    """Groups of 2 and 6 runs with weights 2/8 and 6/8: 1 / (0.25^2 / 1 + 0.75^2 / 5)."""
-    found = sandwich(scores_of_a_mean(VALUES[:8, :1], runs_of(["a"] * 2 + ["b"] * 6)))
-    assert found.effective_freedom == pytest.approx([1 / (0.25**2 + 0.75**2 / 5)])
-
-
-def test_a_line_with_one_far_point_has_the_degrees_of_freedom_of_bell_and_mccaffrey() -> None:
-    """From the residual maker I - X (X'X)^-1 X' of a line through five points, as Imbens and Kolesar write it."""
-    columns = np.column_stack([np.ones(5), [0.0, 1.0, 2.0, 3.0, 9.0]])
-    inverse = np.linalg.inv(columns.T @ columns)
-    values = np.array([0.3, -0.2, 0.5, 0.1, -0.4])
-    maker = np.eye(5) - columns @ inverse @ columns.T
-    scores = -columns * (maker @ values)[:, None]
-    hessians = np.einsum("zi,zj->zij", columns, columns)
-    found = sandwich(Scores(scores, hessians, runs_of([None] * 5), np.zeros(2), hessians))
-    corrected = (maker @ values) / np.sqrt(np.diag(maker))
-    weights = inverse @ columns.T
-    np.testing.assert_allclose(np.diag(found.covariance), np.square(weights) @ np.square(corrected), rtol=1e-9)
-    for number in range(2):
-        shares = weights[number] / np.sqrt(np.diag(maker))
-        spread = np.outer(shares, shares) * maker
-        freedom = np.trace(spread) ** 2 / np.square(spread).sum()
-        assert found.effective_freedom[number] == pytest.approx(max(freedom, 1.0))
-    assert found.effective_freedom.max() < 3
-
-
-def fitted(columns: Sequence[Array], values: Sequence[Array], commands: Sequence[str | None]) -> tuple[Array, Scores]:
-    """The least-squares estimate (n,) of runs with columns (k, n) and values (k,), and its scores."""
-    hessians = np.array([of_run.T @ of_run for of_run in columns])
-    answer = np.linalg.solve(hessians.sum(axis=0), sum(a.T @ b for a, b in zip(columns, values, strict=True)))
-    scores = np.array([a.T @ (a @ answer - b) for a, b in zip(columns, values, strict=True)])
-    return answer, Scores(scores, hessians, runs_of(commands), np.zeros(len(answer)), hessians)
-
-
-@pytest.mark.parametrize("commands", [[None] * 8, ["turn", *"aabbccd"]])
-@pytest.mark.parametrize("weak", [0.0, 0.05])
-def test_a_direction_of_one_run_alone_has_the_variance_of_noise(commands: Sequence[str | None], weak: float) -> None:
-    """Unit noise: the mean of the stated variances is that of least squares, with and without a bounded correction."""
-    rng = np.random.default_rng(7)
-    columns = [np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])] + [np.array([[1.0, 0.0], [1.0, weak]])] * 7
-    stated, hits = [], []
-    for _ in range(600):
-        answer, scores = fitted(columns, [rng.standard_normal(len(of_run)) for of_run in columns], commands)
-        found = sandwich(scores)
-        stated.append(np.diag(found.covariance))
-        hits.append(np.abs(answer) < EstimatedCovariance(found.covariance, found.effective_freedom).reach)
-    truth = np.diag(np.linalg.inv(scores.hessians.sum(axis=0)))
-    np.testing.assert_allclose(np.mean(stated, axis=0), truth, rtol=0.08)
-    assert (np.mean(hits, axis=0) > 0.93).all()
-    assert found.effective_freedom.max() <= 7.0
-    assert "directions that one run alone determines" in found.words
-
-
-WITHOUT_SCATTER = [
-    (fitted([np.eye(2)[:1], np.eye(2)[1:]], [np.ones(1), np.ones(1)], [None, None])[1], "one run alone"),
-    (scores_of_a_mean(np.repeat([1.0, 2.0, 6.0], 2)[:, None], runs_of([*"aabbcc"])), "repetitions agree exactly"),
-    (scores_of_a_mean(np.random.default_rng(0).standard_normal((2, 6)), runs_of([None] * 2)), r"too few \(2\)"),
-]
-
-
-@pytest.mark.parametrize(
-    ("scores", "reason"), WITHOUT_SCATTER, ids=["one run a direction", "exact repetitions", "two runs"]
-)
-def test_runs_that_cannot_scatter_have_no_covariance(scores: Scores, reason: str) -> None:
-    with pytest.raises(DataError, match=reason):
-        sandwich(scores)
-
-
-def scores_of_norms(cost: str, errors: Array, jacobian: Array) -> Scores:
-    """Scores of a cost of final poses with known errors (Z, 3) and derivatives (Z, 3, n)."""
-    runs = runs_of([None] * len(errors))
-    odometry = OdometryBatch([run.final_log for run in runs], "arc")
-    objective = costs.create(cost)
-    return scores_of_runs(objective, odometry, errors, jacobian, runs, Noise(pose_position=0.1, pose_heading=0.1))
-
-
-def test_the_scores_are_the_gradient_and_the_hessians_the_curvature_of_the_norms() -> None:
-    rng = np.random.default_rng(2)
-    errors, jacobian = rng.standard_normal((7, 3)) + 2.0, rng.standard_normal((7, 3, 2))
-    found = scores_of_norms("final_pose", errors, jacobian)
-    smooth = np.median(np.linalg.norm(errors, axis=1)) * 7**-0.5
-
-    def share(run: int, numbers: Array) -> float:
-        return float(np.hypot(np.linalg.norm(errors[run] + jacobian[run] @ numbers), smooth)) / 7
-
-    step = 1e-4 * np.eye(2)
-    for run in range(7):
-        gradient = [(share(run, one) - share(run, -one)) / 2e-4 for one in step]
-        np.testing.assert_allclose(found.scores[run], gradient, rtol=1e-6)
-        curvature = [
-            [(share(run, a + b) - share(run, a - b) - share(run, b - a) + share(run, -a - b)) / 4e-8 for a in step]
-            for b in step
-        ]
-        np.testing.assert_allclose(found.hessians[run], curvature, rtol=1e-4, atol=1e-6)
-
-
-def test_the_hessian_of_headings_alone_is_twice_the_density_of_their_errors_at_zero() -> None:
-    """For normal errors of unit variance the median of n has the variance 1 / (4 n f(0)^2) = pi / 2n."""
-    count = 4_001
-    errors = np.zeros((count, 3))
-    errors[:, 2] = np.random.default_rng(5).standard_normal(count)
-    errors[:, 2] -= np.median(errors[:, 2])
-    jacobian = np.zeros((count, 3, 1))
-    jacobian[:, 2] = 1.0
-    found = scores_of_norms("final_heading", errors, jacobian)
-    assert found.hessians.sum() == pytest.approx(2 / np.sqrt(2 * np.pi), rel=0.05)
-    assert sandwich(found).covariance[0, 0] == pytest.approx(np.pi / 2 / count, rel=0.1)
-
-
-def test_commands_that_scatter_as_their_repetitions_do_are_seldom_taken_for_a_lack_of_fit() -> None:
-    """Planes through five commands of unequal leverage: two are left over, and the level of the test is 0.1 %."""
-    rng = np.random.default_rng(11)
-    commands = [name for name in "abcde" for _ in range(3)]
-    misfits = 0
-    for _ in range(400):
-        columns = np.repeat(rng.standard_normal((5, 3)), 3, axis=0)
-        values = rng.standard_normal(15)
-        left = values - columns @ np.linalg.lstsq(columns, values)[0]
-        hessians = np.einsum("zi,zj->zij", columns, columns)
-        misfits += sandwich(
-            Scores(-columns * left[:, None], hessians, runs_of(commands), np.zeros(3), hessians)
-        ).lack_of_fit
-    assert misfits <= 4
-
-
-def test_poses_that_the_answer_passes_through_do_not_make_the_cost_sharper_and_may_not_be_half() -> None:
-    rng = np.random.default_rng(4)
-    errors, jacobian = rng.standard_normal((9, 3)), rng.standard_normal((9, 3, 2))
-    errors[:2] = 1e-13
-    found = scores_of_norms("final_pose", errors, jacobian)
-    width = np.median(np.linalg.norm(errors[2:], axis=1)) * 9**-0.5
-    np.testing.assert_allclose(found.hessians[0], jacobian[0].T @ jacobian[0] / width / 9, rtol=1e-6)
-    errors[:5] = 0.0
-    with pytest.raises(DataError, match="half of the poses"):
-        scores_of_norms("final_pose", errors, jacobian)
 
 
 # What recordings can tell before anything is fitted, what they leave open, and what they cannot tell apart.

@@ -1,0 +1,128 @@
+"""Maximum a posteriori: the most probable matrix and lost wheel rate, by all references and the robot's design.
+
+What it minimises stands in fit/estimate.py, what is known of a design in fit/prior.py, and its intervals in
+fit/jackknife.py. Beside the matrix stands one effect that all robots here have in common, the rate that every turning
+wheel loses or gains (``wheel_dead_zone``): rollers creep, tyres slip in turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from omnibench.config import NonNegative, Positive
+from omnibench.errors import DataError
+from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.estimate import Estimate, EstimateProblem, Nuisances, Unknown, estimate, steering_unknowns
+from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.loss import loss_of
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
+from omnibench.fit.problem import CalibrationProblem
+from omnibench.registry import Options, calibrators
+from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
+
+_EFFECT, _PARAMETER = "wheel_dead_zone", "c"
+_MOST_STEPS = 40  # of the estimate, for its progress
+_FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
+
+
+class MapOptions(Options):
+    """Options: what is estimated beside the matrix."""
+
+    lost_rate: NonNegative | None = Field(
+        None,
+        description="standard deviation of the rate that turning wheels lose, rad/s; 0: none; default: the class's",
+    )
+    start_heading: NonNegative = Field(
+        0.005, description="standard deviation of the runs' start headings, rad; 0: they are exact"
+    )
+    clock: Literal["none", "offset", "offset_and_slope"] = Field(
+        "offset", description="of the reference, estimated for each run; none: it is exact"
+    )
+    clock_offset: Positive = Field(0.1, description="its expected size, s")
+    clock_slope: Positive = Field(0.003, description="its expected size, s per s")
+    steering: Literal["known", "fit"] = Field("known", description="fit: also its gain, play and coupling, or zero")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_former_options(cls, content: Any) -> Any:
+        """Take options of trajectory_ml: an exact start has no deviation, and the others have no use any more."""
+        if not isinstance(content, dict):
+            return content
+        exact = {"start_heading": 0.0} if content.get("start") == "exact" else {}
+        return exact | {name: value for name, value in content.items() if name not in _FORMER}
+
+
+@calibrators.register("map", former=("posterior", "trajectory_ml"))
+class Map(Calibrator):
+    """Most probable wheels, track and lost wheel rate, given all references and the design (maximum a posteriori)."""
+
+    Options = MapOptions
+    options: MapOptions
+    bounded = False  # its prior takes the place of the box
+    weighs_design = True
+    extends = True
+    stochastic = False
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        """Gauss-Newton steps to the minimum. DataError: no run has a reference after its start."""
+        self.needs_matrix(problem)
+        robot, options = problem.robot, self.options
+        tolerance = physical_tolerance(robot)
+        if problem.tolerance is not None:  # of the elements, and nothing else
+            tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
+        lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
+        clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
+        loss = loss_of(problem.objective)
+
+        def most_probable(unknowns: tuple[Unknown, ...]) -> Estimate:
+            of_runs = EstimateProblem(
+                robot,
+                problem.trajectories,
+                problem.parameterisation.projection @ physical_prior_root(robot, tolerance),
+                problem.integration,
+                problem.sample_period,
+                unknowns,
+                Nuisances(options.start_heading, *clock),
+                "huber" if loss == "squares" else loss,
+            )
+            return estimate(of_runs, may_go_on)
+
+        def may_go_on(steps: int) -> bool:
+            problem.report(steps, _MOST_STEPS, "step")
+            return problem.seconds_left > 0
+
+        of_wheels = (Unknown(_EFFECT, _PARAMETER, lost),) if lost else ()
+        if options.steering == "fit":
+            steered = steering_unknowns(robot)
+            found = min((most_probable((*of_wheels, *unknowns)) for unknowns in steered), key=lambda tried: tried.error)
+        else:
+            found = most_probable(of_wheels)
+        clusters = Clusters.of(problem.trajectories)
+        unit = np.eye(found.root.shape[1])
+        covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
+        end = f"{'' if found.at_rest else 'not '}at rest after {found.steps} steps"
+        extension, size = None, found.matrix.size
+        if found.terms:
+            extension = ModelExtension(
+                effects=tuple(map(EffectTerm.of, found.terms)),
+                covariance=covariance_rows(covariance.matrix),
+                plain=matrix_rows(most_probable(()).matrix),
+            )
+        if lost:
+            rate = float(found.terms[0].values[_PARAMETER])
+            end += f"; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
+        if not np.isfinite(problem.cost(found.matrix.reshape(1, -1))).all():
+            raise DataError("the cost of its answer is not finite")
+        freedom = np.broadcast_to(covariance.degrees_of_freedom, len(found.root))[:size]
+        return Solution(
+            found.matrix.ravel(),
+            f"{end}; intervals: {clusters.words}",
+            converged=found.at_rest,
+            covariance=covariance.matrix[:size, :size],
+            degrees_of_freedom=np.array(freedom),
+            extension=extension,
+        )

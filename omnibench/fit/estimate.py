@@ -1,0 +1,420 @@
+"""The most probable odometry model of a robot: by its references, and by what is known of its design.
+
+The unknowns u are independent standard normal numbers before the robot has been driven. They are what the matrix K has
+beyond its design K0, by a root L of the class's prior (prior.py), the parameters b of effects beside the matrix, and
+the offsets of gyros, one a session:
+
+    K = K0 + L z,    b = b0 + s e,    u = (z, e, o).                                                            (1)
+
+Everything that was observed is a row of errors r of x, y and heading (or of a length, or an angle), predicted less
+observed, which has the standard deviation sigma by what measured it. A run's poses are cut into five stretches of its
+path and its end; a stretch is one row, the medians of its errors, sigma 0, which single poses that have jumped do not
+move. What the model misses, such as slip, is the same along a run, however often it is measured: with T rows of one
+kind in a run, a row counts with the variance
+
+    v = sigma^2 + T w^2,                                                                                   (2)
+
+so that a run counts as one observation of what its rows share, and as T of what measured them. What is minimised is
+
+    sum over rows  rho(r) / v  +  |u|^2,    rho by the loss at  x^2 = sum r^2 / (sigma^2 + w^2),           (3)
+
+with Huber's corner, so that rows that are far off pull in proportion and not by their square. w is what the errors of a
+kind show beyond sigma at the minimum: with the loss's weights h, and over the n runs that have some,
+
+    w^2 = n / (n - 1) sum (h/T) r^2 / sum (h/T)  -  sum (h/T) sigma^2 / sum (h/T).                         (4)
+
+Gauss-Newton steps solve (3), with w and h taken anew after each. The first ones take w as 1 cm and 10 mrad: from the
+errors of the design, data would seem to say nothing.
+
+Nuisances of a run, its start heading or the offset and slope of its reference's clock, have normal priors, too, and are
+eliminated from the normal equations of their run (Schur complement).
+
+Source: maximum a posteriori estimate with variances by empirical Bayes (Efron and Morris, J. Am. Stat. Assoc. 70:311,
+1975), which bears a model that is wrong in small things: the errors that it cannot explain set the weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnibench.data.dataset import Trajectory
+from omnibench.errors import ConfigError, DataError
+from omnibench.fit.loss import Loss, LossName, Squares, make_loss
+from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
+from omnibench.registry import effects
+from omnibench.robot.corrections import corrected, needs_of
+from omnibench.robot.effects.effect import Term, make_term
+from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
+from omnibench.robot.signals import signals_of
+from omnibench.robot.stored_odometry import together
+
+# Half and twice of the stretches change the mean error of a robot by 7 % at most (tests/studies/prior_study.py).
+_STRETCHES = 5  # stretches that a run's path is cut into; chosen
+_POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady; chosen
+_FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
+_LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
+_STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
+_MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
+_UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
+PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter of an effect on wheels or steering that is estimated beside the matrix.
+
+    middle, deviation: mean and standard deviation of its prior, in the parameter's unit.
+    """
+
+    effect: str
+    parameter: str
+    deviation: float
+    middle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """Prior standard deviations of what is estimated of each run with poses: rad, s, s per s; 0: known exactly."""
+
+    start_heading: float = 0.0
+    clock_offset: float = 0.0
+    clock_slope: float = 0.0
+
+    @property
+    def deviations(self) -> Array:
+        """The deviations (3,)."""
+        return np.array([self.start_heading, self.clock_offset, self.clock_slope])
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The most probable model, and what each run says of it.
+
+    matrix (3, M), m and rad per rad. terms: effects beside it. unknowns (k,): as in Eq. (1). root (3M + p, k):
+    derivatives of the matrix elements, row by row, and of the p parameters of the effects by these. information
+    (Z, k, k) and scores (Z, k): Hessian and slope of half of each run's part of Eq. (3) at the minimum. excess: w of
+    Eq. (4) by the kind of error, m or rad.
+    """
+
+    matrix: Array
+    terms: tuple[Term, ...]
+    unknowns: Array
+    root: Array
+    information: Array
+    scores: Array
+    excess: dict[str, float]
+    steps: int
+    at_rest: bool
+
+    @property
+    def error(self) -> float:
+        """The product of the excess errors: the smaller, the better the runs are explained."""
+        return float(np.prod(list(self.excess.values())))
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateProblem:
+    """What is estimated from which runs.
+
+    root (3M, q): of the prior's covariance of the matrix elements about the design. sample_period: nominal, s.
+    """
+
+    robot: Robot
+    runs: Sequence[Trajectory]
+    root: Array
+    integration: Integration
+    sample_period: float
+    unknowns: tuple[Unknown, ...] = ()
+    nuisances: Nuisances = Nuisances()
+    loss: LossName = "huber"
+    stretches: int = _STRETCHES
+
+    def answer(self, unknowns: Array) -> tuple[Array, tuple[Term, ...]]:
+        """The matrix (3, M) and the effects of unknowns (k,), Eq. (1)."""
+        design, count = self.robot.inverse_kinematic_matrix, self.root.shape[1]
+        by_effect: dict[str, dict[str, float]] = {}
+        for unknown, share in zip(self.unknowns, unknowns[count:].tolist(), strict=False):
+            value = unknown.middle + share * unknown.deviation
+            by_effect.setdefault(unknown.effect, {})[unknown.parameter] = value
+        terms = tuple(make_term(name, parameters, self.robot) for name, parameters in by_effect.items())
+        return design + (self.root @ unknowns[:count]).reshape(design.shape), terms
+
+
+STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
+# Factors on the measured angle about which a gain is looked for: gears between an encoder and its wheel are seldom
+# known worse than this, and between two of them the errors have one minimum (tests/fit/test_wheeled_fits.py).
+_FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
+
+
+def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
+    """Gain, play and coupling of a robot's steering, or a car's zero; a gain's prior about each of some factors.
+
+    Their plausible ranges are their standard deviations. A lag is not among them: a wrong clock of the reference looks
+    alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
+    """
+    parameters = [
+        (effect.name, parameter)
+        for effect in map(effects.create, STEERING)
+        if effect.applies(robot)
+        for parameter in effect.parameters(robot)
+    ]
+    if not parameters:
+        raise ConfigError(f"steering: fit is for wheels that steer; robot {robot.name} has none")
+    return [
+        tuple(
+            Unknown(name, parameter.name, parameter.largest, (factor - 1) * (name == STEERING[0]))
+            for name, parameter in parameters
+        )
+        for factor in _FACTORS
+    ]
+
+
+def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True) -> Estimate:
+    """The minimum of Eq. (3) by Gauss-Newton steps from the design. DataError: no run has a reference after its start.
+
+    may_go_on: asked before each step but the first, with the number of those that were made.
+    """
+    rows, loss = _Rows(problem), make_loss(problem.loss, 3) or Squares(3)
+    unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
+    excess: Array = np.full(len(rows.kinds), _FIRST)
+    weights: Array = np.ones(len(rows.run))
+    steps, at_rest = 0, False
+    while steps < _MOST_STEPS and not at_rest and (not steps or may_go_on(steps)):
+        errors, slopes, drifts = rows.linearised(unknowns)
+        errors = rows.without_nuisances(errors, drifts, weights[:, None] * rows.precisions(excess))
+        if steps >= _FIRST_STEPS:
+            excess = rows.excess(errors, weights)
+        weights = loss.weights(np.sqrt(np.nansum(np.square(errors) / rows.variances(excess), axis=1)))
+        weights = weights / loss.weights(np.zeros(1))
+        information, scores = rows.normal_equations(errors, slopes, drifts, weights[:, None] * rows.precisions(excess))
+        step = -np.linalg.solve(information.sum(axis=0) + np.eye(len(unknowns)), scores.sum(axis=0) + unknowns)
+        unknowns, steps = unknowns + step, steps + 1
+        at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
+    matrix, terms = problem.answer(unknowns)
+    root = np.zeros((matrix.size + len(problem.unknowns), len(unknowns)))
+    root[: matrix.size, : problem.root.shape[1]] = problem.root
+    for number, unknown in enumerate(problem.unknowns):
+        root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
+    information = information - rows.bent(errors, slopes, weights, excess, loss)
+    kinds = dict(zip(rows.kinds, excess.tolist(), strict=True))
+    return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps, at_rest)
+
+
+class _Rows:
+    """The rows of errors of a problem.
+
+    run (S,): index of each row's run. sigmas (S, 3): NaN where nothing was measured. kinds: names of the kinds of
+    error. gyros: number of the sessions whose gyro has an offset.
+    """
+
+    def __init__(self, problem: EstimateProblem) -> None:
+        self._problem = problem
+        self._posed = [index for index, run in enumerate(problem.runs) if run.has_poses]
+        self._chosen = [_chosen(len(problem.runs[index].pose_times), problem.stretches) for index in self._posed]
+        counts = [len(firsts) for _, firsts in self._chosen]
+        self.run = np.repeat(np.array(self._posed, dtype=np.intp), counts)
+        self.sigmas, names = np.zeros((len(self.run), 3)), [(PLACE, PLACE, HEADING)] * len(self.run)
+        measured = [index for index, run in enumerate(problem.runs) if run.references is not None]
+        self._references = reference_rows([problem.runs[index] for index in measured], "none") if measured else None
+        self._offsets = np.zeros((len(self.run), 3, 0))
+        if self._references is not None:
+            rows = self._references
+            self.run = np.append(self.run, np.array(measured, dtype=np.intp)[rows.trajectory])
+            sigmas = np.where(rows.tells_no_heading[:, None] & [True, True, False], _UNTOLD, 1.0) * rows.sigmas
+            self.sigmas = np.vstack([self.sigmas, sigmas])
+            # A displacement's error ahead is the way's, to the side the heading's
+            sides = {"displacement": ("displacement ahead", "displacement aside")}
+            names += [
+                (*sides.get(length, (length, length)), angle)
+                for length, angle in zip(rows.lengths.tolist(), rows.angles.tolist(), strict=True)
+            ]
+            # Parts of a recording, cut where samples are missing, are sessions with a number: name#2
+            sessions = [(run.session or "").partition("#")[0] for run in rows.runs]
+            with_offset = [bool(run.references and run.references.rate_sigma) for run in rows.runs]
+            gyros = list(dict.fromkeys(name for name, gyro in zip(sessions, with_offset, strict=True) if gyro))
+            columns = np.array([[name == gyro for gyro in gyros] for name in sessions], dtype=float)
+            of_rows = rows.offset_sigmas[..., None] * columns.reshape(len(sessions), -1)[rows.trajectory][:, None]
+            self._offsets = np.concatenate([np.zeros((len(self.run) - len(of_rows), *of_rows.shape[1:])), of_rows])
+        if not len(self.run):
+            raise DataError("no trajectory has a reference pose after its start; nothing can be fitted")
+        self.gyros = self._offsets.shape[2]
+        seen = ~np.isnan(self.sigmas)
+        self.kinds = list(dict.fromkeys(np.array(names)[seen].tolist()))
+        self._kind = np.array([[self.kinds.index(name) if name in self.kinds else 0 for name in row] for row in names])
+        # T of Eq. (2)
+        self._together = np.ones(self.sigmas.shape)
+        for kind in range(len(self.kinds)):
+            of_kind = seen & (self._kind == kind)
+            in_runs = np.bincount(self.run[of_kind.any(axis=1)], minlength=len(problem.runs))
+            self._together[of_kind] = np.broadcast_to(in_runs[self.run][:, None], of_kind.shape)[of_kind]
+
+    def linearised(self, unknowns: Array) -> tuple[Array, Array, Array]:
+        """Errors (S, 3), their derivatives (S, 3, k) by the unknowns, and (S, 3, m) by the m nuisances in deviations.
+
+        What was not measured is 0.
+        """
+        problem, count = self._problem, self._problem.root.shape[1]
+        matrix, terms = problem.answer(unknowns)
+        errors, jacobian, drifts = self._of_model(matrix, terms)
+        columns = [jacobian @ problem.root]
+        for number in range(len(problem.unknowns)):
+            moved = unknowns.copy()
+            moved[count + number] += _STEP
+            further, _, _ = self._of_model(*problem.answer(moved), slopes=False)
+            columns.append(((further - errors) / _STEP)[..., None])
+        offsets = unknowns[count + len(problem.unknowns) :]
+        return errors + self._offsets @ offsets, np.concatenate([*columns, self._offsets], axis=2), drifts
+
+    def _of_model(self, matrix: Array, terms: Sequence[Term], *, slopes: bool = True) -> tuple[Array, Array, Array]:
+        """Errors (S, 3) by a matrix (3, M) and effects, and their derivatives by the matrix elements and nuisances."""
+        problem = self._problem
+        errors, jacobians, drifts = list[Array](), list[Array](), list[Array]()
+        acting = [term for term in terms if any(term.values.values())]
+        number = 0
+        for part in together([problem.runs[index] for index in self._posed]):
+            chosen = self._chosen[number : number + len(part)]
+            number += len(part)
+            driven = corrected_runs(problem.robot, part, acting, problem.sample_period) if acting else part
+            logs = [run.log(run.pose_times[index]) for run, (index, _) in zip(driven, chosen, strict=True)]
+            odometry = OdometryBatch(logs, problem.integration)
+            poses = odometry.poses(matrix[None])[0]
+            seen = np.concatenate([run.poses[index] for run, (index, _) in zip(part, chosen, strict=True)])
+            starts = np.cumsum([0, *(len(index) for index, _ in chosen)])
+            firsts = np.concatenate([first + start for (_, first), start in zip(chosen, starts, strict=False)])
+            counts = np.diff([*firsts, len(poses)])[:, None, None]
+            errors += [np.median(stretch, axis=0) for stretch in np.split(poses - seen, firsts[1:])]
+            if slopes:
+                jacobian = odometry.jacobian(matrix).reshape(len(poses), 3, -1)
+                jacobians.append(np.add.reduceat(jacobian, firsts, axis=0) / counts)
+                drifts.append(np.add.reduceat(self._drifts(logs, poses, matrix), firsts, axis=0) / counts)
+        if self._references is not None:
+            rows = self._references
+            if acting:
+                rows = replace(rows, runs=corrected_runs(problem.robot, rows.runs, acting, problem.sample_period))
+            batch = ReferenceBatch(rows, problem.integration)
+            predicted = batch.poses(matrix[None])[0]
+            errors += list(np.where(rows.measured, predicted - rows.observed, 0.0))
+            if slopes:
+                jacobian = batch.jacobian(matrix).reshape(len(predicted), 3, -1)
+                jacobians.append(np.where(rows.measured[..., None], jacobian, 0.0))
+                drifts.append(np.zeros((len(predicted), 3, np.count_nonzero(problem.nuisances.deviations))))
+        if not slopes:
+            return np.array(errors), np.empty(0), np.empty(0)
+        return np.array(errors), np.concatenate(jacobians), np.concatenate(drifts)
+
+    def _drifts(self, logs: Sequence[WheelLog], poses: Array, matrix: Array) -> Array:
+        """Derivatives (K, 3, m) of poses (K, 3) by the nuisances that are estimated, in their deviations."""
+        deviations = self._problem.nuisances.deviations
+        if not deviations.any():
+            return np.zeros((*poses.shape, 0))
+        path = poses - np.repeat([log.start for log in logs], [len(log.stamps) for log in logs], axis=0)
+        turned = np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1)
+        stamps, velocity = np.concatenate([log.stamps for log in logs]), np.zeros(poses.shape)
+        if deviations[1:].any():
+            # Differences over two samples: the rate of a single one has its full encoder noise
+            period = self._problem.sample_period
+            late, early = (
+                OdometryBatch(
+                    [replace(log, stamps=log.stamps + shift).continued(float(log.stamps[-1] + shift)) for log in logs],
+                    self._problem.integration,
+                ).poses(matrix[None])[0]
+                for shift in (period, -period)
+            )
+            velocity = (late - early) / (2 * period)
+        columns = np.stack([turned, -velocity, -velocity * stamps[:, None]], axis=2) * deviations
+        return np.asarray(columns[..., deviations > 0])
+
+    def excess(self, errors: Array, weights: Array) -> Array:
+        """w of Eq. (4) by kind, of errors (S, 3) with the loss's weights (S,)."""
+        values = np.zeros(len(self.kinds))
+        for number, kind in enumerate(self.kinds):
+            rows, axes = np.nonzero((self._kind == number) & ~np.isnan(self.sigmas))
+            shares = weights[rows] / self._together[rows, axes]
+            count = len(np.unique(self.run[rows]))
+            seen = count / max(count - 1, 1) * float(shares @ np.square(errors[rows, axes])) / shares.sum()
+            known = float(shares @ np.square(self.sigmas[rows, axes])) / shares.sum()
+            least = _LEAST if kind in (PLACE, HEADING) else 0.0
+            values[number] = np.sqrt(max(seen - known, least**2))
+        return values
+
+    def variances(self, excess: Array) -> Array:
+        """sigma^2 + w^2 (S, 3) of each row by itself; NaN where nothing was measured."""
+        return np.square(self.sigmas) + np.square(excess)[self._kind]
+
+    def precisions(self, excess: Array) -> Array:
+        """1/v (S, 3) of Eq. (2); 0 where nothing was measured."""
+        return np.nan_to_num(1 / (np.square(self.sigmas) + self._together * np.square(excess)[self._kind]))
+
+    def without_nuisances(self, errors: Array, drifts: Array, precisions: Array) -> Array:
+        """Errors (S, 3) with each run's nuisances at their likeliest."""
+        if not drifts.shape[2]:
+            return errors
+        inner, along = self._of_nuisances(drifts, precisions, errors[..., None])
+        values = -np.linalg.solve(inner, along)[..., 0]
+        return errors + np.einsum("scm,sm->sc", drifts, values[self.run])
+
+    def normal_equations(self, errors: Array, slopes: Array, drifts: Array, precisions: Array) -> tuple[Array, Array]:
+        """Hessians (Z, k, k) and slopes (Z, k) of half of the runs' parts of Eq. (3), nuisances eliminated.
+
+        errors (S, 3): with nuisances at their likeliest.
+        """
+        roots = np.sqrt(precisions)
+        columns = slopes * roots[..., None]
+        scores = self._by_run(np.einsum("sci,sc->si", columns, errors * roots))
+        information = self._by_run(np.einsum("sci,scj->sij", columns, columns))
+        if drifts.shape[2]:
+            inner, along = self._of_nuisances(drifts, precisions, slopes)
+            information = information - np.swapaxes(along, 1, 2) @ np.linalg.solve(inner, along)
+        return information, scores
+
+    def bent(self, errors: Array, slopes: Array, weights: Array, excess: Array, loss: Loss) -> Array:
+        """What curvature (Z, k, k) the runs lack where the loss is no parabola: x h'(x) along each row's error."""
+        ratios = np.sqrt(np.nansum(np.square(errors) / self.variances(excess), axis=1))
+        lost = -loss.slopes(ratios) / loss.weights(np.zeros(1))
+        scaled = errors * np.sqrt(self.precisions(excess))
+        units = scaled / np.maximum(np.linalg.norm(scaled, axis=1), np.finfo(float).tiny)[:, None]
+        along = np.einsum("sci,sc->si", slopes * np.sqrt(self.precisions(excess))[..., None], units)
+        assert weights.shape == lost.shape
+        return self._by_run(lost[:, None, None] * along[:, :, None] * along[:, None, :])
+
+    def _of_nuisances(self, drifts: Array, precisions: Array, slopes: Array) -> tuple[Array, Array]:
+        """1 + N'PN (Z, m, m) and N'P J (Z, m, k) for the columns N of nuisances and J of others."""
+        weighted = drifts * precisions[..., None]
+        inner = self._by_run(np.einsum("sci,scj->sij", weighted, drifts)) + np.eye(drifts.shape[2])
+        return inner, self._by_run(np.einsum("sci,scj->sij", weighted, slopes))
+
+    def _by_run(self, values: Array) -> Array:
+        """Sums (Z, ...) over the rows of each run."""
+        sums = np.zeros((len(self._problem.runs), *values.shape[1:]))
+        np.add.at(sums, self.run, values)
+        return sums
+
+
+def _chosen(poses: int, stretches: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of the poses of a run that are looked at, and of the first of each stretch among these.
+
+    The last pose, where the robot stands, is a stretch of its own.
+    """
+    spread = np.linspace(1, poses - 1, min(_POSES * stretches, poses - 1))
+    index = np.unique(np.round(spread).astype(np.intp))
+    parts = np.arange(len(index)) * stretches // len(index)
+    parts[-1] = stretches
+    return index, np.unique(parts, return_index=True)[1].astype(np.intp)
+
+
+def corrected_runs(
+    robot: Robot, runs: Sequence[Trajectory], terms: Sequence[Term], sample_period: float
+) -> tuple[Trajectory, ...]:
+    """Runs whose rates are the drive signals (F, M) of a robot with effects on its wheels and steering angles."""
+    design, needs = robot.inverse_kinematic_matrix, needs_of(terms)
+    made = []
+    for run in runs:
+        true = corrected(terms, signals_of(run.final_log, robot, design, sample_period, needs))
+        signals = robot.drive.signals(true.rates, true.steering)
+        made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
+    return tuple(made)
