@@ -10,10 +10,10 @@ from omnibench.data.dataset import Split, Trajectory
 from omnibench.discover.fitting import Extended, Fit
 from omnibench.fit.noise import NoiseEstimate
 from omnibench.fit.trajectory_fit import Nuisances
-from omnibench.robot.physical import EstimatedCovariance
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.physical import EstimatedCovariance
 
 ROBOT = Robot.model_validate(APR02)
 MATRIX = ROBOT.inverse_kinematic_matrix

@@ -19,11 +19,11 @@ from scipy import stats
 
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.problem import Budget, CalibrationProblem, make_parameterisation
-from omnibench.robot.physical import EstimatedCovariance
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array, Robot, Wheel, wheel_equations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
+from omnibench.robot.physical import EstimatedCovariance
 from omnibench.simulate.commands import Commands
 from omnibench.simulate.config import EncoderNoise, FlowerConfig, Session, Truth
 from omnibench.simulate.source import simulate_dataset
