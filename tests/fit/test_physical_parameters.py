@@ -82,15 +82,23 @@ OMNI = APR_02.model_copy(
 MARKER = Mount(x=0.02, y=0.03)
 
 
-def test_a_marker_36_mm_off_the_centre_of_three_omni_wheels_leaves_their_distances_as_they_are() -> None:
+@pytest.mark.parametrize("calibrator", ["map", "closed_form"])
+def test_a_marker_36_mm_off_the_centre_of_three_omni_wheels_leaves_their_distances_as_they_are(calibrator: str) -> None:
     seen = recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)
-    known, fitted = named(calibrate(seen)), named(calibrate(seen, mount="fit"))
-    assert not is_inside(known["distance_b"], 0.155)  # the marker counts as wheels that stand elsewhere
-    for found in (fitted, named(calibrate(make_dataset("d", declared(), PERIOD, seen.trajectories)))):
+    fitted = named(calibrate(seen, calibrator, mount="fit"))
+    for found in (fitted, named(calibrate(make_dataset("d", declared(), PERIOD, seen.trajectories), calibrator))):
         assert all(is_inside(found[f"distance_{wheel}"], 0.155) for wheel in "abc")
     assert is_inside(fitted["mount_x"], 0.02)
     assert is_inside(fitted["mount_y"], 0.03)
-    assert "mount_x" not in known
+    assert fitted["mount_y"].low > 0.01
+    assert "mount_x" not in named(calibrate(seen, calibrator))
+
+
+def test_the_tracked_point_of_two_wheels_is_fitted_where_that_is_asked_for() -> None:
+    point = Mount(x=-0.015, y=0.01, yaw=0.02)
+    found = named(calibrate(recording(DIFFERENTIAL, point.twist @ DIFFERENTIAL.inverse_kinematic_matrix), mount="fit"))
+    truth = {"mount_x": point.x, "mount_y": point.y, "mount_yaw": point.yaw, "track": 0.3, "radius_left": 0.05}
+    assert all(is_inside(found[name], value) for name, value in truth.items())
 
 
 def declared() -> Robot:
