@@ -36,9 +36,8 @@ from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset
 from omnibench.data.finding import CLOCKS, LACKING, MISREAD, SPOILED, UNREAD, Finding, error
 from omnibench.errors import computable
+from omnibench.fit.estimate import estimate, usual_problem
 from omnibench.fit.evaluate import looked_at, verdict_on
-from omnibench.fit.linear_fit import quick_fit
-from omnibench.robot.model import OdometryModel
 from omnibench.views import screenful
 from omnibench.words import noun_for, plural
 
@@ -220,14 +219,16 @@ def _mended(evidence: Evidence) -> RecordingSource | None:
 
 
 def expected_gain(dataset: Dataset, errors: Set[str] = frozenset()) -> tuple[bool | None, str]:
-    """The verdict on a quick fit to the training runs, as ``calibrate`` judges its own: is it needed, and in words.
+    """The verdict on the default estimate from the training runs, as ``calibrate`` judges its own: is it needed, and in words.
 
     errors: kinds of the errors that were found; clocks that are off, and jumps, hide whether there is a gain.
     """
     robot, held_out = dataset.robot, dataset.split("validation")
     training = looked_at(dataset.split("train") or held_out)
-    model = OdometryModel(robot, quick_fit(robot, training), "arc")
-    verdict = verdict_on(model, training, looked_at(held_out) if dataset.split("train") else ())
+    problem = usual_problem(robot, training)
+    verdict = verdict_on(
+        estimate(problem).model(problem), training, looked_at(held_out) if dataset.split("train") else ()
+    )
     needed = {"better": True, "worse": False}.get(verdict.verdict)
     small = verdict.improvement is not None and abs(verdict.improvement) < _SMALL
     if verdict.verdict == "undecided" and small and verdict.units >= _ENOUGH:

@@ -98,8 +98,9 @@ def calibrate(
     slip alone may explain them, which the run's warnings name. ``keep``: the matrix has the design values there;
     ``fit``: it is fitted there, too. tolerance: standard deviation of the design's elements, for map; default: that of
     the robot's class.
-    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the matrix
-    is the same, and its place is told from the distances of the wheels as far as these are as designed.
+    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the
+    matrix of calibrators but map is the same, and the place is told from the distances of its wheels, as far as these
+    are as designed.
     Cost and mount have defaults that depend on the robot: on few runs the whole trajectory is the cost; the tracked
     point of tricycles and cars is fitted.
     steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are estimated, too, and are effects of

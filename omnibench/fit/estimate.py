@@ -42,13 +42,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
+from omnibench.data.stored import count_drawn, drawn_runs, median_period
 from omnibench.errors import ConfigError, DataError
 from omnibench.fit.loss import Loss, LossName, Squares, make_loss
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.registry import effects
 from omnibench.robot.corrections import corrected, needs_of
 from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
 from omnibench.robot.signals import signals_of
 from omnibench.robot.stored_odometry import together
@@ -59,8 +62,11 @@ _POSES = 12  # most reference poses of a stretch that are looked at: their media
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
 _LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
 _STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
+_RESTING_OF_MANY = 0.03  # prior deviations: the same where a step reads very many samples; chosen
 _MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
 _UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
+LOST_RATE = ("wheel_dead_zone", "c")  # the effect that every robot has, and its parameter
+USUAL_NUISANCES = (0.005, 0.1)  # rad and s, of start headings and of clocks: see calibrators/map.py
 PLACE, HEADING = "pose position", "pose heading"  # kinds of error of poses
 
 
@@ -116,6 +122,10 @@ class Estimate:
         """The product of the excess errors: the smaller, the better the runs are explained."""
         return float(np.prod(list(self.excess.values())))
 
+    def model(self, problem: EstimateProblem) -> OdometryModel:
+        """The odometry model that was estimated for a problem."""
+        return OdometryModel(problem.robot, self.matrix, problem.integration, self.terms, problem.sample_period)
+
 
 @dataclass(frozen=True, eq=False)
 class EstimateProblem:
@@ -134,6 +144,11 @@ class EstimateProblem:
     loss: LossName = "huber"
     stretches: int = _STRETCHES
 
+    @property
+    def size(self) -> int:
+        """Number of matrix elements and parameters of effects."""
+        return len(self.root) + len(self.unknowns)
+
     def answer(self, unknowns: Array) -> tuple[Array, tuple[Term, ...]]:
         """The matrix (3, M) and the effects of unknowns (k,), Eq. (1)."""
         design, count = self.robot.inverse_kinematic_matrix, self.root.shape[1]
@@ -143,6 +158,14 @@ class EstimateProblem:
             by_effect.setdefault(unknown.effect, {})[unknown.parameter] = value
         terms = tuple(make_term(name, parameters, self.robot) for name, parameters in by_effect.items())
         return design + (self.root @ unknowns[:count]).reshape(design.shape), terms
+
+
+def usual_problem(robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc") -> EstimateProblem:
+    """What the calibrator map estimates by its default options: matrix, lost rate, start headings and clocks."""
+    tolerance = physical_tolerance(robot)
+    root = physical_prior_root(robot, tolerance)
+    lost = (Unknown(*LOST_RATE, tolerance.lost_rate),)
+    return EstimateProblem(robot, runs, root, integration, median_period(runs), lost, Nuisances(*USUAL_NUISANCES))
 
 
 STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
@@ -174,17 +197,27 @@ def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
     ]
 
 
-def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True) -> Estimate:
-    """The minimum of Eq. (3) by Gauss-Newton steps from the design. DataError: no run has a reference after its start.
+def estimate(
+    problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True, near: Estimate | None = None
+) -> Estimate:
+    """The minimum of Eq. (3) by Gauss-Newton steps. DataError: no run has a reference after its start.
 
-    may_go_on: asked before each step but the first, with the number of those that were made.
+    may_go_on: asked before each step but the first, with the number of those that were made. near: where the steps
+    begin, in the place of the design; of very many runs at the estimate from some that chance has drawn.
     """
+    many = count_drawn(problem.runs) < len(problem.runs)
+    if many and near is None:
+        near = estimate(replace(problem, runs=drawn_runs(problem.runs)), may_go_on)
     rows, loss = _Rows(problem), make_loss(problem.loss, 3) or Squares(3)
     unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
+    if near is not None:
+        common = min(len(unknowns), len(near.unknowns)) if near.root.shape[0] == problem.size else problem.root.shape[1]
+        unknowns[:common] = near.unknowns[:common]
     excess: Array = np.full(len(rows.kinds), _FIRST)
     weights: Array = np.ones(len(rows.run))
-    steps, at_rest = 0, False
-    while steps < _MOST_STEPS and not at_rest and (not steps or may_go_on(steps)):
+    first, resting = 0 if near is None else _FIRST_STEPS, _RESTING_OF_MANY if many else _RESTING
+    steps, at_rest = first, False
+    while steps < _MOST_STEPS and not at_rest and (steps == first or may_go_on(steps)):
         errors, slopes, drifts = rows.linearised(unknowns)
         errors = rows.without_nuisances(errors, drifts, weights[:, None] * rows.precisions(excess))
         if steps >= _FIRST_STEPS:
@@ -194,7 +227,7 @@ def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda
         information, scores = rows.normal_equations(errors, slopes, drifts, weights[:, None] * rows.precisions(excess))
         step = -np.linalg.solve(information.sum(axis=0) + np.eye(len(unknowns)), scores.sum(axis=0) + unknowns)
         unknowns, steps = unknowns + step, steps + 1
-        at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
+        at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < resting)
     matrix, terms = problem.answer(unknowns)
     root = np.zeros((matrix.size + len(problem.unknowns), len(unknowns)))
     root[: matrix.size, : problem.root.shape[1]] = problem.root
@@ -202,7 +235,7 @@ def estimate(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda
         root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
     information = information - rows.bent(errors, slopes, weights, excess, loss)
     kinds = dict(zip(rows.kinds, excess.tolist(), strict=True))
-    return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps, at_rest)
+    return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps - first, at_rest)
 
 
 class _Rows:

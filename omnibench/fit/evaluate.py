@@ -17,7 +17,7 @@ from omnibench.data.references import UNITS, ReferenceKind
 from omnibench.data.stored import drawn_runs
 from omnibench.errors import computable, require_type
 from omnibench.fit.cost import NO_ERROR
-from omnibench.fit.linear_fit import quick_fit
+from omnibench.fit.estimate import Estimate, estimate, usual_problem
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.fit.reference_rows import errors_by_kind, mean_errors, measured_parts
 from omnibench.fit.sessions import compare_sessions
@@ -32,8 +32,8 @@ from omnibench.words import noun_for, plural
 _SHOWN = 6  # runs that are named; the rest are counted (chosen: two lines of a terminal)
 _PARTS = 5  # of the commands, each left out once by cross-validation
 _FEWEST_CROSSED = 4  # runs, below which nothing can be left out
-_MOST = 120  # runs that quick fits look at; chosen: a second
-# Share of what a quick fit gains on all runs: a model that gains less is not judged by quick fits. Chosen.
+_MOST = 120  # runs that a verdict looks at; chosen: some seconds
+# Share of what the default estimate gains on all runs: a model that gains less is not judged by it. Chosen.
 _AS_GOOD = 0.9
 _ALIKE = 0.1  # by which the angles that wheels turn may differ in repetitions of a command; chosen
 _MEANINGS = {"better": "better than the design", "worse": "worse than the design: do not use"}
@@ -290,8 +290,8 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     Held-out runs decide if they are of ten units or more (commands, or runs where none repeats): an error that a
     calibration halves is told from chance in 27 % of sets of three units, 67 % of five and 94 % of ten; where few
     commands count for most, in 17, 39 and 73 % (tests/studies/improvement_coverage.py, kinds usual and tails). If
-    they are fewer, and all runs have more units, cross-validation decides, unless they say worse, or quick fits do not
-    stand for the model: it has effects, or does not gain on all runs what a quick fit to these gains.
+    they are fewer, and all runs have more units, cross-validation by the default estimate decides, unless they say
+    worse, or that estimate does not stand for the model: the model does not gain on all runs what it gains on these.
     """
     design = OdometryModel.of_design(model.robot, model.integration)
     verdict = nothing_held_out()
@@ -299,19 +299,23 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
         verdict = judge(final_errors(design, held_out), final_errors(model, held_out), held_out)
     every = looked_at([*training, *held_out])
     decided = verdict.units >= BOOTSTRAPPED or verdict.verdict == "worse"
-    if decided or model.terms or not training or len(every) < _FEWEST_CROSSED:
+    if decided or not training or len(every) < _FEWEST_CROSSED:
         return verdict
     names = command_names(every)
     runs = [replace(run, command=name) for run, name in zip(every, names, strict=True)]
     units = units_of(runs).count
-    if units <= verdict.units or units < FEWEST or not _gains_as_quick_fits(model, every):
+    if units <= verdict.units or units < FEWEST:
+        return verdict
+    whole = estimate(usual_problem(model.robot, every, model.integration))
+    if not _gains_as_much(model, whole, every):
         return verdict
     part_of = {name: number % _PARTS for number, name in enumerate(sorted(set(names)))}
     errors, parts = [], list[Trajectory]()
     for part in range(min(_PARTS, len(part_of))):
         out = [run for run in runs if part_of[run.command or ""] == part]
         rest = [run for run in runs if part_of[run.command or ""] != part]
-        fitted = replace(model, matrix=quick_fit(model.robot, rest, model.integration))
+        problem = usual_problem(model.robot, rest, model.integration)
+        fitted = estimate(problem, near=whole).model(problem)
         errors.append((final_errors(design, out), final_errors(fitted, out)))
         parts += out
     before, after = (np.concatenate(of_parts) for of_parts in zip(*errors, strict=True))
@@ -319,21 +323,20 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     beside = f"no run was held out from this fit; {verdict.detail}"
     if held_out:
         beside = f"too little was held out to decide: {verdict.sentence}"
-    manner = f"{crossed.unit}s were left out by turns and predicted by quick fits to the others; {beside}"
+    manner = f"{crossed.unit}s were left out by turns and predicted by estimates from the others; {beside}"
     return crossed.model_copy(update={"detail": f"{crossed.detail.rpartition('; ')[0]}; {manner}"})
 
 
-def _gains_as_quick_fits(model: OdometryModel, runs: Sequence[Trajectory]) -> bool:
-    """True if a quick fit to the runs says how a model does: the model gains at least nine tenths as much."""
-    matrices = (model.robot.inverse_kinematic_matrix, quick_fit(model.robot, runs, model.integration), model.matrix)
-    design, quick, fitted = (
-        float(np.linalg.norm(final_errors(replace(model, matrix=matrix), runs), axis=1).mean()) for matrix in matrices
-    )
-    return design - fitted >= _AS_GOOD * (design - quick) if quick < design else fitted >= design
+def _gains_as_much(model: OdometryModel, whole: Estimate, runs: Sequence[Trajectory]) -> bool:
+    """True if the default estimate from the runs says how a model does: the model gains at least nine tenths as much."""
+    estimated = replace(model, matrix=whole.matrix, terms=whole.terms, fade=None)
+    models = (OdometryModel.of_design(model.robot, model.integration), estimated, model)
+    design, usual, fitted = (float(np.linalg.norm(final_errors(each, runs), axis=1).mean()) for each in models)
+    return design - fitted >= _AS_GOOD * (design - usual) if usual < design else fitted >= design
 
 
 def looked_at(runs: Sequence[Trajectory]) -> list[Trajectory]:
-    """The runs that quick fits look at: of very many some that chance has drawn, in memory."""
+    """The runs that a verdict looks at: of very many some that chance has drawn, in memory."""
     drawn = np.sort(np.random.default_rng(0).permutation(len(runs))[:_MOST]).tolist()
     return drawn_runs([runs[index] for index in drawn])
 

@@ -11,25 +11,13 @@ for the matrix with rows m1, m2, m3. With theta(k) interpolated between referenc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.stored import median_period
-from omnibench.fit.cost import NO_ERROR
-from omnibench.fit.estimate import EstimateProblem, estimate
-from omnibench.fit.prior import default_cost, physical_prior_root, physical_tolerance
-from omnibench.fit.span import directions_kept, driven_span
-from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import Integration, OdometryBatch
-from omnibench.robot.stored_odometry import odometry_of
-
-_SPARSE = 1.0  # s between poses, from which on headings do not lie on lines between them; chosen
-_REWEIGHTED = 10  # steps, of which the best counts; chosen: on README's log the cost is within 1 % of closed_form's
-_VANISHING = 1e-3  # of the mean norm: smaller ones have no larger weight; chosen
-_MOST_POSES = 100_000  # a quick fit takes every n-th pose of n times as many: fewer than twice this number; chosen
+from omnibench.robot.kinematics import Array
+from omnibench.robot.odometry import OdometryBatch
 
 
 def linear_fit(
@@ -65,41 +53,3 @@ def linear_system(
         for run, near in zip(runs, chosen, strict=True)
     )
     return moved, odometry.position_design(headings)
-
-
-def quick_fit(robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc") -> Array:
-    """The matrix (3, M) that fits the poses of runs, or, where none has any, their references."""
-    posed = [run for run in runs if run.has_poses]
-    if not posed:
-        root = physical_prior_root(robot, physical_tolerance(robot))
-        period = median_period(runs)
-        return estimate(EstimateProblem(robot, runs, root, integration, period)).matrix
-    if (every := sum(len(run.poses) for run in posed) // _MOST_POSES) > 1:
-        thinned = slice(None, None, every)
-        posed = [
-            replace(run, pose_times=run.pose_times[thinned], poses=run.poses[thinned], pose_covariances=None)
-            for run in posed
-        ]
-    odometry = odometry_of([run.reference_log for run in posed], integration)
-    observed = np.concatenate([run.poses[1:] for run in posed])
-    held = directions_kept(robot, driven_span(posed), "keep")
-    _, _, directions = np.linalg.svd(np.vstack([held, np.zeros((1, len(robot.drive.names)))]))
-    directions = directions[len(held) :]
-    matrix = linear_fit(odometry, posed, observed, robot.inverse_kinematic_matrix, directions)
-    sparse = float(np.median(np.concatenate([np.diff(run.pose_times) for run in posed]))) > _SPARSE
-    if default_cost(robot, len(posed)) == "final_pose":
-        odometry = odometry_of([run.final_log for run in posed], integration)
-        observed = np.array([run.final_pose for run in posed])
-    elif not sparse:
-        return matrix
-    # The cost is a sum of norms: least squares that are weighted by 1 / norm lead to its minimum.
-    free, tried = np.kron(np.eye(3), directions.T), []
-    for number in range(_REWEIGHTED):
-        errors = odometry.poses(matrix[None])[0] - observed
-        norms = np.linalg.norm(errors, axis=1)
-        tried.append((float(norms.mean()), number, matrix))
-        roots = 1 / np.sqrt(np.maximum(norms, _VANISHING * norms.mean() + NO_ERROR))[:, None]
-        columns = (odometry.jacobian(matrix).reshape(*errors.shape, -1) @ free) * roots[..., None]
-        step = np.linalg.lstsq(columns.reshape(errors.size, -1), (roots * errors).ravel(), rcond=None)[0]
-        matrix = matrix - (free @ step).reshape(matrix.shape)
-    return min(tried)[2]

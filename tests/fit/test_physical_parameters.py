@@ -106,13 +106,11 @@ def declared() -> Robot:
 
 
 def test_a_fitted_mount_is_in_the_file_and_an_attribute() -> None:
-    run = calibrate(recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix), mount="fit")
+    seen = recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)
+    run = calibrate(seen, "closed_form", mount="fit")
     assert run.calibration.provenance.mount == "fit"
     assert math.hypot(run.calibration.mount.x - 0.02, run.calibration.mount.y - 0.03) < 0.002
-    assert (
-        run.calibration.matrix
-        == calibrate(recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)).calibration.matrix
-    )
+    assert run.calibration.matrix == calibrate(seen, "closed_form").calibration.matrix
 
 
 def test_wrong_lengths_are_doubted_in_one_line() -> None:
@@ -127,7 +125,7 @@ def test_wrong_lengths_are_doubted_in_one_line() -> None:
 
 def test_runs_without_turns_leave_the_distances_without_interval() -> None:
     data = make_dataset("ring", synthetic_robot(), 0.1, rolled(RING, slip=0.02))
-    found = named(calibrate(data))
+    found = named(calibrate(data, "closed_form"))
     assert [name for name, each in found.items() if each.low is None] == ["distance_a", "distance_b", "distance_c"]
 
 

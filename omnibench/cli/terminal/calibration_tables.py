@@ -28,7 +28,6 @@ from omnibench.robot.kinematics import relative_deviations
 from omnibench.words import plural
 
 _NONE = "no interval"
-_NO_BREAK = "\u00a0"
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
 _ROWS = ("x (m/rad)", "y (m/rad)", "w (rad/rad)")
 _NOTHING_TO_GAIN = 0.01  # share of the cost that is not worth another search; chosen

@@ -16,7 +16,16 @@ from pydantic import Field, model_validator
 from omnibench.config import NonNegative, Positive
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.estimate import Estimate, EstimateProblem, Nuisances, Unknown, estimate, steering_unknowns
+from omnibench.fit.estimate import (
+    LOST_RATE,
+    USUAL_NUISANCES,
+    Estimate,
+    EstimateProblem,
+    Nuisances,
+    Unknown,
+    estimate,
+    steering_unknowns,
+)
 from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.parameterisation import MatrixElements
@@ -25,7 +34,6 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
 
-_EFFECT, _PARAMETER = "wheel_dead_zone", "c"
 _MOST_STEPS = 40  # of the estimate, for its progress
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
@@ -38,12 +46,12 @@ class MapOptions(Options):
         description="standard deviation of the rate that turning wheels lose, rad/s; 0: none; default: the class's",
     )
     start_heading: NonNegative = Field(
-        0.005, description="standard deviation of the runs' start headings, rad; 0: they are exact"
+        USUAL_NUISANCES[0], description="standard deviation of the runs' start headings, rad; 0: they are exact"
     )
     clock: Literal["none", "offset", "offset_and_slope"] = Field(
         "offset", description="of the reference, estimated for each run; none: it is exact"
     )
-    clock_offset: Positive = Field(0.1, description="its expected size, s")
+    clock_offset: Positive = Field(USUAL_NUISANCES[1], description="its expected size, s")
     clock_slope: Positive = Field(0.003, description="its expected size, s per s")
     steering: Literal["known", "fit"] = Field("known", description="fit: also its gain, play and coupling, or zero")
 
@@ -82,7 +90,7 @@ class Map(Calibrator):
 
         root = physical_prior_root(robot, tolerance, "known" if searched.known_mount else "fit")
 
-        def most_probable(unknowns: tuple[Unknown, ...]) -> Estimate:
+        def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
             of_runs = EstimateProblem(
                 robot,
                 problem.trajectories,
@@ -93,13 +101,13 @@ class Map(Calibrator):
                 Nuisances(options.start_heading, *clock),
                 "huber" if loss == "squares" else loss,
             )
-            return estimate(of_runs, may_go_on)
+            return estimate(of_runs, may_go_on, near)
 
         def may_go_on(steps: int) -> bool:
             problem.report(steps, _MOST_STEPS, "step")
             return problem.seconds_left > 0
 
-        of_wheels = (Unknown(_EFFECT, _PARAMETER, lost),) if lost else ()
+        of_wheels = (Unknown(*LOST_RATE, lost),) if lost else ()
         if options.steering == "fit":
             steered = steering_unknowns(robot)
             found = min((most_probable((*of_wheels, *unknowns)) for unknowns in steered), key=lambda tried: tried.error)
@@ -114,10 +122,10 @@ class Map(Calibrator):
             extension = ModelExtension(
                 effects=tuple(map(EffectTerm.of, found.terms)),
                 covariance=covariance_rows(covariance.matrix),
-                plain=matrix_rows(most_probable(()).matrix),
+                plain=matrix_rows(most_probable((), found).matrix),
             )
         if lost:
-            rate = float(found.terms[0].values[_PARAMETER])
+            rate = float(found.terms[0].values[LOST_RATE[1]])
             end += f"; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
         if not np.isfinite(problem.cost(found.matrix.reshape(1, -1))).all():
             raise DataError("the cost of its answer is not finite")
