@@ -309,7 +309,7 @@ def test_the_numbers_of_two_wheels_and_of_a_tricycle_are_attributes() -> None:
     two = calibration(DIFF)
     assert two.track == pytest.approx(values_of(two)["track"])
     assert two.radius.keys() == {"left", "right"}
-    assert two.mount.y == pytest.approx(values_of(two).get("mount_y", 0.0))
+    assert two.mount == Mount()
     assert calibration(TRICYCLE).wheelbase == pytest.approx(values_of(calibration(TRICYCLE))["wheelbase"])
 
 

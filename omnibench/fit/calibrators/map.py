@@ -29,6 +29,7 @@ from omnibench.fit.estimate import (
 )
 from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.fit.loss import loss_of
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -82,7 +83,8 @@ class Map(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Gauss-Newton steps to the minimum. DataError: no run has a reference after its start."""
         self.needs_matrix(problem)
-        robot, options = problem.robot, self.options
+        robot, options, searched = problem.robot, self.options, problem.parameterisation
+        assert isinstance(searched, MatrixElements)
         tolerance = physical_tolerance(robot)
         if problem.tolerance is not None:  # of the elements, and nothing else
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
@@ -91,11 +93,13 @@ class Map(Calibrator):
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
 
+        root = physical_prior_root(robot, tolerance, "known" if searched.known_mount else "fit")
+
         def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
             of_runs = EstimateProblem(
                 robot,
                 runs,
-                problem.parameterisation.projection @ physical_prior_root(robot, tolerance),
+                searched.projection @ root,
                 problem.integration,
                 problem.sample_period,
                 unknowns,
