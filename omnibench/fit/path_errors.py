@@ -75,14 +75,13 @@ class PathError(Model):
 
 @dataclass(frozen=True, eq=False)
 class EndErrors:
-    """Ends of Z runs by a calibration, and what their errors are made of.
+    """Ends of Z runs by a calibration, and what slip makes of them.
 
-    ends (Z, 3): m, m, rad. calibrated (Z, 3, 3): S of Eq. (1). rolled (Z,): m of Eq. (2), m. levers (Z, 3, 3): the sum
+    ends (Z, 3): m, m, rad. rolled (Z,): m of Eq. (2), m. levers (Z, 3, 3): the sum
     of Eq. (2) over the path. ways (Z, 2): of the ends from the starts, m.
     """
 
     ends: Array
-    calibrated: Array
     rolled: Array
     levers: Array
     ways: Array
@@ -100,11 +99,7 @@ class EndErrors:
             turned = np.column_stack([path[:, 1] - path[-1, 1], path[-1, 0] - path[:, 0], np.ones(len(path))])
             rolled[number], levers[number] = metres.sum(), (turned * metres[:, None]).T @ turned
         ends = np.array([path[-1] for path in paths])
-        calibrated = np.zeros((len(logs), 3, 3))
-        if calibration.covariance is not None:
-            slopes = _slopes(model, logs, np.array(calibration.covariance))
-            calibrated = slopes @ np.array(calibration.covariance) @ np.swapaxes(slopes, 1, 2)
-        return cls(ends, calibrated, rolled, levers, ends[:, :2] - np.array([log.start[:2] for log in logs]))
+        return cls(ends, rolled, levers, ends[:, :2] - np.array([log.start[:2] for log in logs]))
 
     @property
     def of_reference(self) -> Array:
@@ -119,6 +114,15 @@ class EndErrors:
             return np.zeros_like(self.levers)
         beside = np.diag(np.square([slip.position, slip.position, slip.heading])) - np.diag([0.0, 0.0, slip.way**2])
         return self.rolled[:, None, None] * beside + slip.way**2 * self.levers
+
+
+def calibration_covariances(calibration: Calibration, logs: Sequence[WheelLog]) -> Array:
+    """Covariances (Z, 3, 3) of the ends of logs by what is not known of a calibration, Eq. (1); 0 if untold."""
+    if calibration.covariance is None:
+        return np.zeros((len(logs), 3, 3))
+    covariance = np.array(calibration.covariance)
+    slopes = _slopes(calibration.model, logs, covariance)
+    return np.asarray(slopes @ covariance @ np.swapaxes(slopes, 1, 2))
 
 
 def _slopes(model: OdometryModel, logs: Sequence[WheelLog], covariance: Array) -> Array:
@@ -202,7 +206,8 @@ def predicted_errors(calibration: Calibration, paths: Sequence[str] = ()) -> tup
     biases = np.array([path[-1] for path in design.poses(logs)]) - ends.ends
     runs = None if calibration.slip is None else calibration.slip.runs
     errors = []
-    for path, covariance, bias in zip(chosen, ends.calibrated + ends.of_slip(calibration.slip), biases, strict=True):
+    covariances = calibration_covariances(calibration, logs) + ends.of_slip(calibration.slip)
+    for path, covariance, bias in zip(chosen, covariances, biases, strict=True):
         models: tuple[tuple[Literal["calibration", "design"], Array], ...] = (
             ("calibration", np.zeros(3)),
             ("design", bias),

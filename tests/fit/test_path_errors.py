@@ -13,7 +13,7 @@ from omnibench.data.references import Reference, References
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.path_errors import (
-    EndErrors,
+    calibration_covariances,
     error_region,
     predicted_errors,
     regions_lack,
@@ -230,5 +230,5 @@ def test_ends_of_logs_have_the_covariance_that_the_matrix_elements_spread() -> N
     log = wheel_log(known, legs_of("square 1.0", DIFFERENTIAL))
     drawn = rng.multivariate_normal(np.array(known.matrix).ravel(), np.array(known.covariance), 400)
     spread = np.cov([replace(known.model, matrix=row.reshape(3, 2)).poses([log])[0][-1] for row in drawn], rowvar=False)
-    (predicted,) = EndErrors.of(known, [log]).calibrated
+    (predicted,) = calibration_covariances(known, [log])
     assert np.sqrt(np.diag(spread)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15, abs=1e-4)

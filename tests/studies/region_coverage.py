@@ -22,7 +22,7 @@ from scipy.stats import beta
 
 from omnibench.compare.plan import PlannedRun
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.path_errors import EndErrors, error_region, slip_of
+from omnibench.fit.path_errors import EndErrors, calibration_covariances, error_region, slip_of
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot.calibration import Calibration, matrix_rows
 from omnibench.study.config import MethodChoice
@@ -88,9 +88,12 @@ def judged_fits(data: str | None) -> Iterator[Judged]:
         for kind, indices in fit.fold.judged.items():
             if indices:
                 runs = [fit.robot.dataset.trajectories[index] for index in indices]
-                ends = EndErrors.of(calibration, [run.final_log for run in runs])
+                logs = [run.final_log for run in runs]
+                ends = EndErrors.of(calibration, logs)
                 errors = ends.ends - np.array([run.final_pose for run in runs])
-                covariances = ends.calibrated + ends.of_slip(calibration.slip) + ends.of_reference
+                covariances = (
+                    calibration_covariances(calibration, logs) + ends.of_slip(calibration.slip) + ends.of_reference
+                )
                 assert calibration.slip is not None  # all runs have poses
                 regions = [error_region(each, np.zeros(3), calibration.slip.runs) for each in covariances]
                 radii = np.array(regions)[:, [1, 3]]
