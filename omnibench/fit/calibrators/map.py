@@ -27,8 +27,9 @@ from omnibench.fit.estimate import (
     estimate,
     steering_unknowns,
 )
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.jackknife import FEWEST_SESSIONS, Clusters, jackknife
 from omnibench.fit.loss import loss_of
+from omnibench.fit.motion_windows import windows_of
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
@@ -38,6 +39,7 @@ from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_r
 # Wheel samples of the runs that are looked at, 3 hours at 100 Hz: more runs say no more of a robot than slip lets them,
 # and take minutes; chosen.
 _MOST_SAMPLES = 1_000_000
+_WINDOW = 12.0  # s, of the parts of one or two long runs; chosen, as recordings of one drive are cut on import
 _MOST_STEPS = 40  # of the estimate, for its progress
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
@@ -89,6 +91,12 @@ class Map(Calibrator):
         if problem.tolerance is not None:  # of the elements, and nothing else
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
         runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
+        if len(Clusters.of(runs).members) < FEWEST_SESSIONS:  # of a run or two nothing says how far they scatter
+            runs = [
+                window
+                for run in runs
+                for window in (windows_of(run, max(int(run.end / _WINDOW), 1)) if run.has_poses else [run])
+            ]
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
