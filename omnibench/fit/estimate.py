@@ -168,8 +168,8 @@ def usual_problem(robot: Robot, runs: Sequence[Trajectory], integration: Integra
 
 
 STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupling")
-# Factors on the measured angle about which a gain is looked for, each known to itself, so that its neighbours are
-# within a standard deviation: gears between an encoder and its wheel are seldom known worse (tests/fit).
+# Factors on the measured angle about which a gain is looked for, each with itself as the standard deviation, so that
+# its neighbours are within one: gears between an encoder and its wheel are seldom known worse.
 _FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
 

@@ -17,7 +17,7 @@ from omnibench.data.references import UNITS, ReferenceKind
 from omnibench.data.stored import drawn_runs
 from omnibench.errors import computable, require_type
 from omnibench.fit.cost import NO_ERROR
-from omnibench.fit.estimate import Estimate, estimate, usual_problem
+from omnibench.fit.estimate import estimate, usual_problem
 from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
 from omnibench.fit.reference_rows import errors_by_kind, mean_errors, measured_parts
 from omnibench.fit.sessions import compare_sessions
@@ -306,8 +306,9 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     units = units_of(runs).count
     if units <= verdict.units or units < FEWEST:
         return verdict
-    whole = estimate(usual_problem(model.robot, every, model.integration))
-    if not _gains_as_much(model, whole, every):
+    problem = usual_problem(model.robot, every, model.integration)
+    whole = estimate(problem)
+    if not _gains_as_much(model, whole.model(problem), every):
         return verdict
     part_of = {name: number % _PARTS for number, name in enumerate(sorted(set(names)))}
     errors, parts = [], list[Trajectory]()
@@ -327,9 +328,8 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
     return crossed.model_copy(update={"detail": f"{crossed.detail.rpartition('; ')[0]}; {manner}"})
 
 
-def _gains_as_much(model: OdometryModel, whole: Estimate, runs: Sequence[Trajectory]) -> bool:
+def _gains_as_much(model: OdometryModel, estimated: OdometryModel, runs: Sequence[Trajectory]) -> bool:
     """True if the default estimate says how a model does: the model gains at least nine tenths as much."""
-    estimated = replace(model, matrix=whole.matrix, terms=whole.terms, fade=None)
     models = (OdometryModel.of_design(model.robot, model.integration), estimated, model)
     design, usual, fitted = (float(np.linalg.norm(final_errors(each, runs), axis=1).mean()) for each in models)
     return design - fitted >= _AS_GOOD * (design - usual) if usual < design else fitted >= design

@@ -116,10 +116,6 @@ class SearchBox:
         """Names of the free elements that lie on a bound of the box."""
         return tuple(name for name, touching in zip(self.names, self.on_bounds(vector), strict=True) if touching)
 
-    def without_interval(self, at_bounds: tuple[str, ...]) -> NDArray[np.bool_]:
-        """True (n,) for the elements that the fit could not move both ways: on a bound of the box, or held by it."""
-        return np.asarray(np.isin(self.names, (*at_bounds, *self.held)))
-
 
 class Record:
     """Evaluations, seconds and best candidates of one run of a calibrator, within its budget."""

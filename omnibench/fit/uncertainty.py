@@ -40,7 +40,6 @@ from omnibench.words import plural
 # (tests/studies/constants_fit.py).
 _MOST_STEPS = 20  # steps
 _NO_GAIN = 1e-4  # relative decrease of the cost that ends the steps
-_SHARES = (1.0, 0.5, 0.2, 0.1)  # of a Newton step that are tried: far from a minimum of norms whole ones lead too far
 _INTERPOLATED = 1e-6  # share of the median error: smaller ones were made zero by the fit, up to rounding
 # Width of the kernel, in medians of the errors times the number of runs to the power -1/5 (the rate of density
 # estimates: Silverman, Density Estimation, 1986, section 3.3). Stated deviations of medians then are 0.78 to 1.19 times
@@ -113,7 +112,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
-    untold = depending(slopes, problem.without_interval(result.at_bounds)) | elements_open(problem.parameterisation)
+    untold = depending(slopes, _not_moved(problem, result)) | elements_open(problem.parameterisation)
+    untold |= ~slopes.any(axis=1)  # such as the row sideways of a robot that cannot slide
     reach = np.where(untold, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
@@ -124,6 +124,11 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         basis=basis,
         source="the calibrator's own (see its reason)" if basis == "likelihood" else clusters.words,
     )
+
+
+def _not_moved(problem: CalibrationProblem, result: RunResult) -> NDArray[np.bool_]:
+    """True (n,) for the numbers that the fit could not move both ways: on a bound of the box, or held."""
+    return np.asarray(np.isin(problem.names, (*result.at_bounds, *result.held)))
 
 
 def _by_scatter(problem: CalibrationProblem, result: RunResult, clusters: Clusters) -> EstimatedCovariance:
@@ -173,19 +178,24 @@ def runs_without_heading(problem: CalibrationProblem) -> list[str]:
     return sorted({rows.runs[index].id for index in rows.trajectory[rows.tells_no_heading].tolist()})
 
 
-def _of_runs(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _of_runs(
+    problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], *, bent: bool = True
+) -> tuple[Array, Array]:
     """Slopes (Z, n) and Hessians (Z, n, n) of the runs' parts of the cost by the free numbers, Eq. (1)."""
     odometry, matrix = problem.odometry, problem.matrix(vector)
     columns = problem.parameterisation.slopes(vector)[:, free]
     errors = odometry.poses(matrix[None])[0] - problem.reference
     slopes = odometry.jacobian(matrix).reshape(len(errors), 3, -1) @ columns
-    return sum_of_norms(problem.objective, odometry.trajectory, errors, slopes)
+    return sum_of_norms(problem.objective, odometry.trajectory, errors, slopes, bent=bent)
 
 
-def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: Array) -> tuple[Array, Array]:
+def sum_of_norms(
+    objective: Cost, run: NDArray[np.intp], errors: Array, slopes: Array, *, bent: bool = True
+) -> tuple[Array, Array]:
     """Slopes (Z, n) and Hessians (Z, n, n) of the runs' parts of a cost that is a sum of norms, Eq. (1).
 
-    run (S,): of each row of errors (S, 3), m and rad, with the derivatives slopes (S, 3, n).
+    run (S,): of each row of errors (S, 3), m and rad, with the derivatives slopes (S, 3, n). bent: False: without b,
+    the Hessians of squares that lie above the cost and touch it, whose minimum never costs more.
     """
     base = norms_of(objective)
     assert base is not None  # _by_scatter has checked
@@ -194,7 +204,7 @@ def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: 
     shares, norms = base.shares(run), np.linalg.norm(errors, axis=1)
     if isinstance(objective, RobustCost):
         ratios = norms / objective.loss.scales(norms[None], shares)[0]
-        weights, bent = objective.loss.weights(ratios), objective.loss.slopes(ratios)
+        weights, bends = objective.loss.weights(ratios), objective.loss.slopes(ratios)
     else:
         # Rows of one number, of which the fit makes n exactly zero, need a kernel's width; others hardly change
         measured = np.abs(slopes).max(axis=2) > 0
@@ -210,11 +220,11 @@ def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: 
             width = _KERNEL * count**-0.2 if numbers == 1 else count**-0.5
             widths[alike] = width * float(np.median(norms[alike][apart])) if apart.any() else 1.0
         weights = 1 / np.hypot(norms, widths)
-        bent = -np.square(norms) * weights**3
+        bends = -np.square(norms) * weights**3
     units = errors / np.maximum(norms, np.finfo(float).tiny)[:, None]
     along = np.einsum("sci,sc->si", slopes, units)
     by_row = (shares * weights)[:, None, None] * np.einsum("sci,scj->sij", slopes, slopes)
-    by_row += (shares * bent)[:, None, None] * along[:, :, None] * along[:, None, :]
+    by_row += bent * (shares * bends)[:, None, None] * along[:, :, None] * along[:, None, :]
     slope, hessian = np.zeros((count, slopes.shape[2])), np.zeros((count, *by_row.shape[1:]))
     np.add.at(slope, run, (shares * weights * norms)[:, None] * along)
     np.add.at(hessian, run, by_row)
@@ -222,20 +232,21 @@ def sum_of_norms(objective: Cost, run: NDArray[np.intp], errors: Array, slopes: 
 
 
 def _check_minimum(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], clusters: Clusters) -> None:
-    """NoCovarianceError: Newton's steps to a lower cost lead farther than a standard deviation there."""
+    """NoCovarianceError: steps of reweighted least squares lead farther than a standard deviation to a lower cost."""
     better, cost = vector, float(problem.values(vector[None])[0])
     for _ in range(_MOST_STEPS):
-        slope, hessian = _of_runs(problem, better, free)
+        slope, hessian = _of_runs(problem, better, free, bent=False)
         roots = roots_of(hessian.sum(axis=0))
-        tries = np.repeat(better[None], len(_SHARES), axis=0)
-        tries[:, free] -= np.outer(_SHARES, roots @ roots.T @ slope.sum(axis=0))
-        values = problem.values(tries)
-        if not values.min() < cost * (1 - _NO_GAIN):
+        moved = better.copy()
+        moved[free] -= roots @ roots.T @ slope.sum(axis=0)
+        value = float(problem.values(moved[None])[0])
+        if not value < cost * (1 - _NO_GAIN):
             break
-        better, cost = tries[values.argmin()], float(values.min())
+        better, cost = moved, value
     away = np.abs(better - vector)[free]
     if not away.any():
         return
+    slope, hessian = _of_runs(problem, better, free)
     deviations = np.sqrt(np.maximum(np.diag(jackknife(hessian, slope, clusters).matrix), 0.0))
     count = float(np.max(away[deviations > 0] / deviations[deviations > 0], initial=0.0))
     if count > 1.0:
@@ -266,7 +277,7 @@ def physical_parameters(
     if result.extension is not None and result.extension.covariance is not None:
         covariance = np.array(result.extension.covariance)
         freedom = max(len(Clusters.of(problem.trajectories).members) - 1, 1)
-    held = problem.without_interval(result.at_bounds)
+    held = _not_moved(problem, result)
     unknown = [problem.parameterisation.slopes(result.vector)[:, held].T]
     if uncertainty is None or uncertainty.basis != "posterior":  # which the design tells, too
         unknown.append(np.kron(np.eye(3), problem.unidentified))

@@ -255,17 +255,6 @@ def test_held_out_runs_that_err_more_by_far_are_not_outvoted() -> None:
     assert (found.basis, found.verdict) == ("held_out", "worse")
 
 
-def test_cross_validation_does_not_stand_for_a_model_with_effects() -> None:
-    dataset = recordings(validating=3)
-    plain = calibrate(dataset).calibration.model
-    slip = EffectTerm(name="centripetal_slip", parameters={"k": 0.0}).term(ROBOT)
-    found = [
-        verdict_on(model, dataset.split("train"), dataset.split("validation")).basis
-        for model in (plain, replace(plain, terms=(slip,), sample_period=0.2))
-    ]
-    assert found == ["cross_validation", "held_out"]
-
-
 def test_all_runs_of_another_recording_are_held_out() -> None:
     calibration = calibrate(recordings(validating=0)).calibration
     found = evaluate(calibration, recordings(validating=0, name="another day")).held_out
