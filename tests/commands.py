@@ -289,7 +289,10 @@ def prepare() -> Prepared:
     folder = shared_folder() / "prepared"
     config = write_config(folder)
     data, truth, calibration = folder / "data", folder / "truth", folder / "calibration.yaml"
-    for arguments in (("simulate", config, "-o", data, "--truth", truth), ("calibrate", data, "-o", calibration)):
+    for arguments in (
+        ("simulate", config, "-o", data, "--truth", truth),
+        ("calibrate", data, "--calibrator", "closed_form", "-o", calibration),
+    ):
         run = run_here(*arguments, cwd=folder)
         assert run.returncode == 0, run.stderr
     return Prepared(config, data, truth, calibration)

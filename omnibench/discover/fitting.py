@@ -11,8 +11,7 @@ many standard deviations from what the others predict:
 The score of a pose is the largest of those in x, y and heading. What a model lacks raises scores, too, but wherever the
 robot does the same again: at one stamp of a command's repetitions, or of most runs. An outlier stands out of these.
 
-The covariance of matrix elements and parameters is that of every trajectory fit
-(fit/calibrators/trajectory_ml.py).
+The covariance of matrix elements and parameters is that of the noise, or of the scatter where the model does not fit.
 """
 
 from __future__ import annotations

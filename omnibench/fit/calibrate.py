@@ -50,12 +50,12 @@ def words_of(terms: Sequence[Term]) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationRun(Shown):
-    """A calibration, the calibrator's result and, where asked for, resampled 95 % intervals of the elements.
+    """A calibration, and the calibrator's result.
 
     parameters: radii, track or wheelbase or distances, angles, ..., which the matrix and its effects mean; none where
     it has no such reading. uncertainty: covariance of the elements; None if there is none, then a warning says why.
     warnings: one sentence for every part of the calibration that the data do not determine. kept: motions that keep the
-    design values; intervals hold only if these are right. units: what these resample.
+    design values; intervals hold only if these are right.
     """
 
     calibration: Calibration

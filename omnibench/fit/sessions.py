@@ -78,7 +78,7 @@ from omnibench.words import plural
 # Share of a command's median duration that a run must last: a shorter one would cut all others (chosen).
 _WHOLE = 0.5
 # Share of the largest singular value below which a direction is rounding, and of the noise model's variance below which
-# the scatter is: repetitions that agree exactly (trajectory_ml.py).
+# the scatter is: repetitions that agree exactly.
 _ROUNDING = 1e-6
 # Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
 # hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).

@@ -109,26 +109,24 @@ def test_a_calibration_of_an_older_version_says_what_its_regions_lack(
 def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
     found = document(command("calibrate", prepared.data, "--json", "-o", tmp_path / "c.yaml"))
     assert found == json.loads(read_calibration(tmp_path / "c.yaml").model_dump_json())
-    assert list(found["parameters"]) == [
-        f"{kind}_{wheel}" for kind in ("radius", "distance", "angle") for wheel in "abc"
-    ]
+    of_wheels = [f"{kind}_{wheel}" for kind in ("radius", "distance", "angle") for wheel in "abc"]
+    assert list(found["parameters"]) == [*of_wheels, "lost_rate"]
     assert list(found["parameters"]["radius_a"]) == ["design", "value", "unit", "low", "high"]
     assert found["format"] == "omnibench-calibration/1"
     assert np.shape(found["matrix"]) == (3, 3)
 
 
 def test_calibrate_warns_of_what_a_box_holds(command: Command, prepared: Prepared) -> None:
-    printed = succeeded(command("calibrate", prepared.data, "--box", "paper"))
+    printed = succeeded(command("calibrate", prepared.data, "--calibrator", "closed_form", "--box", "paper"))
     assert "not fitted, kept at the start value by the box 'paper' or the cost: m12" in printed.stderr
 
 
 def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command, prepared: Prepared) -> None:
     calibrated = command("calibrate", prepared.data, "-o", "c.yaml").stdout.splitlines()
     evaluated = command("evaluate", "c.yaml", prepared.data).stdout.splitlines()
-    assert calibrated[-2:] == evaluated[-3:-1]
     found = document(command("evaluate", "c.yaml", prepared.data, "--json"))["held_out"]
     assert (found["verdict"], found["unit"], found["units"], len(found["runs"])) == ("better", "run", 6, 6)
-    assert calibrated[-2:] == [found["sentence"], found["detail"]]
+    assert [calibrated.count(found["sentence"]), evaluated.count(found["sentence"])] == [1, 1]
 
 
 def test_what_only_a_live_node_can_run_is_not_exported(command: Command, prepared: Prepared, tmp_path: Path) -> None:

@@ -102,6 +102,7 @@ def test_a_command_with_tables_ends_with_a_sentence_and_cuts_no_word_on_a_narrow
         assert not [line for line in shown[width].splitlines() if len(line) > width and not line.startswith(_PATHS)]
         left_out = words(" ".join(re.findall(r"left out for want of room: .*", shown[width])))
         left_out |= words("left out for want of room columns show all")
+        left_out |= words("not on this screen; --json shows it, -o writes it")
         assert words(shown[width]) - words(shown[500]) - left_out == set()
 
 

@@ -35,7 +35,7 @@ from commands import COMMAND, ENVIRONMENT, Command, Prepared, assert_refused, di
         (["calibrate", "DATA", "-o", "x", "--seconds", "nan"], ["--seconds"]),
         (["calibrate", "DATA", "-o", "x", "--set", "tolerance"], ["--set tolerance", "KEY=VALUE"]),
         (["calibrate", "DATA", "-o", "x", "--set", "a=2023-99-99"], ["--set a=2023-99-99", "month"]),
-        (["calibrate", "DATA", "-o", "x", "--set", "tolerence=1"], ["'tolerence'", "'tolerance'"]),
+        (["calibrate", "DATA", "-o", "x", "--set", "clok=1"], ["'clok'", "clock"]),
         (["calibrate", "DATA", "-o", "DATA"], ["is a folder"]),
         (["calibrate", "DATA", "-o", "CONFIG/x"], ["small.yaml is not a folder"]),
         (["evaluate", "CONFIG", "DATA"], ["omnibench-calibration/1"]),

@@ -102,4 +102,4 @@ def test_a_real_robot_is_calibrated_as_well_as_the_readme_prints(ended: dict[str
     for name in ("train_position_m", "train_heading_rad", "validation_position_m", "validation_heading_rad"):
         assert found["theoretical"][name] > found["closed_form"][name]
     # Other commands, other shapes: there the poses along the way, their clocks set right, are worth as much or more.
-    assert found["trajectory_ml"]["validation_cost"] <= found["closed_form"]["validation_cost"]
+    assert found["map"]["validation_cost"] <= found["closed_form"]["validation_cost"]

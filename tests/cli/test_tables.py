@@ -209,7 +209,7 @@ def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
 @pytest.mark.parametrize("robot", [APR_02, *WHEELED], ids=lambda robot: robot.name)
 def test_a_calibration_shows_physical_parameters_then_the_matrix_on_a_screen_of_80_columns(robot: Robot) -> None:
     runs = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(5))
-    run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), "posterior", mount="fit")
+    run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), mount="fit")
     lines = on_terminal(print_calibration, run, ["file", "verdict", "next", "COMMAND"], width=80).splitlines()
     assert len(lines) <= 25 - 4
     names = [each.name for each in run.parameters]
@@ -242,7 +242,8 @@ def test_without_a_reading_the_matrix_is_shown_alone() -> None:
 
 
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
-    lines = calibration_lines(driven(TRICYCLE), "crs", parameterisation="geometry", budget=Budget(evaluations=200))
+    runs = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(5))
+    lines = calibration_lines(make_dataset("tricycle", TRICYCLE, RECORDED, runs))
     assert any(line.startswith("mount_x") for line in lines)
 
 

@@ -217,7 +217,7 @@ def test_a_data_set_is_compared_by_all_calibrators_that_suit_it(
     first = printed.stderr.splitlines()[0]
     assert first.startswith("no config is given: theoretical, closed_form, crs, ")
     labels = {run["label"] for run in summary(Path("out"))["runs"]}
-    assert labels == {"theoretical", "closed_form", "least_squares", "posterior", "trajectory_ml", *SEARCHES}
+    assert labels == {"theoretical", "closed_form", "least_squares", "map", *SEARCHES}
     config = CompareConfig.model_validate(yaml.safe_load(Path("out/config.yaml").read_text()))
     assert config.budget.evaluations == 300
     assert config.unidentified == "keep"
@@ -228,7 +228,7 @@ def test_every_kind_of_robot_has_calibrators_that_suit(name: str) -> None:
     dataset = simulate_dataset(experiment(name), name).dataset
     names = suitable_calibrators(dataset)
     assert names[0] == "theoretical"
-    assert {"closed_form", "trajectory_ml"} <= set(names)
+    assert {"closed_form", "map"} <= set(names)
     assert "published" not in names
 
 

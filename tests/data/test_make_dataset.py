@@ -283,7 +283,7 @@ def test_standstill_between_runs_is_bounded(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("shift", [10.0, *slow(1e3, 1e4)])
-@pytest.mark.parametrize("calibrator", ["closed_form", "trajectory_ml"])
+@pytest.mark.parametrize("calibrator", ["closed_form", "map"])
 def test_a_pose_that_is_just_believed_gives_an_answer_or_one_line(folder: Path, shift: float, calibrator: str) -> None:
     dataset = load_dataset(folder)
     first, *others = dataset.trajectories

@@ -62,14 +62,17 @@ def mean_errors(model: OdometryModel) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("name", "share"), [("learned", 0.7), ("learned_alone", 0.8)])
 def test_it_predicts_a_slip_that_no_matrix_has(name: str, share: float) -> None:
-    plain, better = mean_errors(calibrate(dataset()).calibration.model), mean_errors(fitted(name).calibration.model)
+    plain, better = (
+        mean_errors(calibrate(dataset(), "closed_form").calibration.model),
+        mean_errors(fitted(name).calibration.model),
+    )
     assert better[0] < share * plain[0]
     assert better[1] < share * plain[1]
 
 
-@pytest.mark.parametrize("unidentified", ["keep", "shrink"])
+@pytest.mark.parametrize("unidentified", ["keep", "fit"])
 def test_the_matrix_is_that_of_closed_form(unidentified: Any) -> None:
-    run, plain = learned(unidentified=unidentified), calibrate(dataset(), unidentified=unidentified)
+    run, plain = learned(unidentified=unidentified), calibrate(dataset(), "closed_form", unidentified=unidentified)
     np.testing.assert_array_equal(run.calibration.matrix_array, plain.calibration.matrix_array)
     assert run.calibration.plain == plain.calibration.matrix
 
@@ -103,7 +106,7 @@ def test_where_the_matrix_explains_the_runs_it_is_the_answer() -> None:
         noise = rng.normal(0, 1, poses.shape) * [1e-3, 1e-3, 2e-3]
         runs.append(replace(run, poses=poses + np.vstack([np.zeros(3), noise[1:]])))
     data = make_dataset("exact", dataset().robot, PERIOD, runs)
-    run, plain = learned(data=data), calibrate(data)
+    run, plain = learned(data=data), calibrate(data, "closed_form")
     assert not run.calibration.effects
     assert "the matrix alone: no gain on held-out runs is sure" in run.result.reason
     assert run.calibration.matrix == plain.calibration.matrix

@@ -15,7 +15,7 @@ from omnibench.study.study_result import StudyResult
 pytestmark = pytest.mark.slow
 
 CONFIG = CONFIGS / "real_robots.yaml"
-METHODS = ("design", "posterior", "closed_form", "kallasi", "lin", "umbmark")
+METHODS = ("design", "map", "closed_form", "kallasi", "lin", "umbmark")
 
 
 def selection() -> StudyConfig:
@@ -62,7 +62,7 @@ def test_the_figures_that_were_measured_beforehand_come_out_within_2_per_cent(
     assert position(studied(), robot, "circular", judged, method) == pytest.approx(figures, rel=0.02)
 
 
-def test_posterior_is_nowhere_worse_than_the_best_published_method_beyond_chance() -> None:
+def test_map_is_nowhere_worse_than_the_best_published_method_beyond_chance() -> None:
     compared = studied().against_best
     assert {each.cell.key.robot for each in compared} == {"tricyc", "omni3"}
     assert all(each.ratio.verdict != "worse" for each in compared)
@@ -70,7 +70,7 @@ def test_posterior_is_nowhere_worse_than_the_best_published_method_beyond_chance
 
 
 def test_a_lost_wheel_rate_explains_the_squares_of_the_omni_robot() -> None:
-    assert position(studied(), "omni3", "circular", "square", "posterior")[0] < 0.05
+    assert position(studied(), "omni3", "circular", "square", "map")[0] < 0.05
     assert position(studied(), "omni3", "circular", "square", "closed_form")[0] > 0.09
 
 
