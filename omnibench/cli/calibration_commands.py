@@ -238,7 +238,19 @@ def calibrate(
 @calibration_app.command()
 def evaluate(
     calibration: shared.CalibrationFile,
-    dataset: shared.DatasetFolders,
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
+    ] = None,
+    paths: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--path",
+            metavar="PATH",
+            help='Path to predict errors for: "straight 1.0" (m), "turn 360" (deg), "circle 1.0 left" (its radius), '
+            '"square 1.0 right" (its side); may be repeated.',
+        ),
+    ] = None,
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
@@ -253,31 +265,41 @@ def evaluate(
     plugins: shared.Plugins = None,
     as_json: shared.Json = False,
 ) -> None:
-    """Show the cost and the errors of a calibration on a data set.
+    """Show a calibration's errors on a data set, and those on paths.
 
-    On each split: the cost, and the errors of the final pose, beside those of the robot's design values.
+    On each split: the cost, and the errors of the final pose, beside those of the robot's design values. On each path:
+    the expected error at its end and the region that holds 95 % of errors. Without DATASET the paths alone.
     """
-    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_verdict_ending
+    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_path_errors, print_verdict_ending
+    from omnibench.fit.path_errors import predicted_errors, regions_lack
     from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
     shared.refuse_report(report, figures, force=force)
+    if not dataset and (report or figures):
+        raise ConfigError("--report and --figures show recordings: name a data set, too")
     tls = shared.tls_files(tls_ca, tls_cert, tls_key)
     with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
-        recordings = omnibench.load_dataset(dataset)
         evaluated = omnibench.read_calibration(calibration)
-        evaluation = omnibench.evaluate(evaluated, recordings)
-    warnings = [*recordings.warnings, *evaluation.warnings]
+        predicted = predicted_errors(evaluated, paths or ())
+        recordings = omnibench.load_dataset(dataset) if dataset else None
+        evaluation = None if recordings is None else omnibench.evaluate(evaluated, recordings)
+    warnings = [lack] if (lack := regions_lack(evaluated)) else []
+    if recordings is not None and evaluation is not None:
+        warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
     warn(warnings)
-    shared.write_asked_report(
-        lambda: calibration_document(evaluated, recordings, evaluation.held_out, evaluation.warnings),
-        report,
-        figures,
-        announced=True,
-    )
+    if recordings is not None and evaluation is not None:
+        of_data = recordings, evaluation.held_out, evaluation.warnings
+        shared.write_asked_report(lambda: calibration_document(evaluated, *of_data), report, figures, announced=True)
     if as_json:
-        return print_json(evaluation.model_dump() | {"warnings": warnings})
-    print_evaluation(make_console(), evaluation)
+        document = {} if evaluation is None else evaluation.model_dump()
+        return print_json(document | {"paths": [error.model_dump() for error in predicted], "warnings": warnings})
+    if evaluation is not None:
+        print_evaluation(make_console(), evaluation)
+    print_path_errors(make_console(), predicted, evaluated)
+    if evaluation is None or dataset is None:
+        other = ("omnibench", "evaluate", str(calibration), "DATASET")
+        return print_ending("these errors are predicted", "see those on recordings", *other)
     print_verdict(evaluation.held_out, sessions=evaluation.sessions)
     return print_verdict_ending(evaluation.held_out, evaluated, calibration, dataset)
 
@@ -358,7 +380,8 @@ def export(
     exported = omnibench.export_calibration(omnibench.read_calibration(calibration), to)
     file = output / exported.file_name if output is not None and output.is_dir() else output
     refuse_existing(file, force=force)
-    warn(exported.warnings)
+    # What is printed holds its warnings, which a terminal need not show twice
+    warn([warning for warning in exported.warnings if file is not None or warning not in exported.text])
     if file is None:
         typer.echo(visible(exported.text), nl=False)
         print_ending(f"{to}: printed, not written", "write it to a file with -o FILE")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +44,7 @@ from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.environment import package_versions
 from omnibench.errors import DataError, computable, require_type
 from omnibench.fit.calibrator import calibration_of_fit
+from omnibench.fit.path_errors import slip_of
 from omnibench.fit.sessions import SessionComparison
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
@@ -371,7 +373,7 @@ def _calibration_of(
         "outcome": "converged",
         "reason": reason,
     }
-    return calibration_of_fit(
+    calibration = calibration_of_fit(
         f"{dataset.name} {name}",
         dataset,
         extended.fit.model.matrix,
@@ -384,6 +386,9 @@ def _calibration_of(
         driven=tuple(tuple(float(value) for value in motion) for motion in validating.training_domain(extended)),
         plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
     )
+    with suppress(DataError):  # as for the costs: runs may lack what an effect needs
+        return calibration.model_copy(update={"slip": slip_of(calibration, dataset.split("train"))})
+    return calibration
 
 
 def _cost(extended: Extended, runs: Sequence[Trajectory]) -> float | None:

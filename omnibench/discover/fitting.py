@@ -16,7 +16,7 @@ The covariance of matrix elements and parameters is that of the noise, or of the
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,6 +29,7 @@ from omnibench.discover.regressors.significance import Group
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
 from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.motion_windows import windows_of
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
@@ -49,40 +50,7 @@ def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
     if repeated or len(runs) >= _ENOUGH:
         return tuple(runs)
     length = max(_SHORTEST, sum(run.end for run in runs) / _MOST)
-    return tuple(window for run in runs for window in _windows(run, max(1, int(run.end / length))))
-
-
-def _windows(run: Trajectory, count: int) -> Iterator[Trajectory]:
-    """So many parts of a run, which begin and end at reference poses."""
-    if count == 1:
-        yield run
-        return
-    wanted = np.linspace(0.0, run.end, count + 1)
-    edges = np.unique(np.clip(np.searchsorted(run.pose_times, wanted), 0, len(run.pose_times) - 1))
-    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        begin, end = float(run.pose_times[first]), float(run.pose_times[last])
-        driven = slice(*np.searchsorted(run.times, [begin, end], side="right").tolist())
-        driven = slice(driven.start, min(driven.stop + 1, len(run.times)))
-        if last - first <= 1 or driven.stop <= driven.start:
-            continue
-        seen = slice(first, last + 1)
-        fields = {
-            name: value[driven]
-            for name in ("rates", "angles", "targets", "steering", "odometry")
-            if (value := getattr(run, name)) is not None
-        }
-        yield replace(
-            run,
-            id=f"{run.id} ({begin:.1f} to {end:.1f} s)",
-            times=run.times[driven] - begin,
-            pose_times=run.pose_times[seen] - begin,
-            poses=run.poses[seen],
-            pose_covariances=None if run.pose_covariances is None else run.pose_covariances[seen],
-            started_at=None if run.started_at is None else run.started_at + begin,
-            command=None,
-            sent=None,
-            **fields,
-        )
+    return tuple(window for run in runs for window in windows_of(run, max(1, int(run.end / length))))
 
 
 _UNKNOWN_NOISE = reference_noise.NoiseEstimate(reference_noise.FIRST_NOISE, "within runs", 1, "")

@@ -17,6 +17,7 @@ from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.open_combinations import open_sentences
+from omnibench.fit.path_errors import slip_of
 from omnibench.fit.prior import default_cost, default_mount, physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
@@ -98,8 +99,9 @@ def calibrate(
     slip alone may explain them, which the run's warnings name. ``keep``: the matrix has the design values there;
     ``fit``: it is fitted there, too. tolerance: standard deviation of the design's elements, for map; default: that of
     the robot's class.
-    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the matrix
-    is the same, and its place is told from the distances of the wheels as far as these are as designed.
+    mount: pose of the tracked point: ``known``, as the robot's file says, or ``fit``. Of a robot that slides the
+    matrix of calibrators but map is the same, and the place is told from the distances of its wheels, as far as these
+    are as designed.
     Cost and mount have defaults that depend on the robot: on few runs the whole trajectory is the cost; the tracked
     point of tricycles and cars is fitted.
     steering: ``fit``: gain, play and coupling of the steering, and a car's zero, are estimated, too, and are effects of
@@ -116,7 +118,8 @@ def calibrate(
     robot, training = dataset.robot, training_split(dataset)
 
     # The choices, with what is usual for this robot and these runs.
-    chosen, calibrator = complete_settings(_with_choices(settings, choices), robot, training)
+    asked = _with_choices(settings, choices)
+    chosen, calibrator = complete_settings(asked, robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
     terms: tuple[Term, ...] = ()
@@ -146,7 +149,7 @@ def calibrate(
     # The physical parameters, the calibration file, and what the data leave open.
     searched = problem.parameterisation
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
-    fitted_mount = chosen.mount == "fit"
+    fitted_mount = (asked.mount or default_mount(robot)) == "fit"
     reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
     return CalibrationRun(
         calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),
@@ -231,7 +234,7 @@ def _calibration(
         "reason": result.reason,
         "held_out": verdict_on(model, training, validation),
     }
-    return calibration_of_fit(
+    calibration = calibration_of_fit(
         f"{dataset.name} {settings.calibrator}",
         dataset,
         result.matrix,
@@ -241,6 +244,7 @@ def _calibration(
         parameters={each.name: each for each in reading.parameters},
         **dict(extension) | {"covariance": extension.covariance or covariance},
     )
+    return calibration.model_copy(update={"slip": slip_of(calibration, training)})
 
 
 def _warnings(

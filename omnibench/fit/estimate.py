@@ -35,7 +35,7 @@ Source: maximum a posteriori estimate with variances by empirical Bayes (Efron a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -215,8 +215,11 @@ def estimate(
     weights: Array = np.ones(len(rows.run))
     first = 0 if near is None else _FIRST_STEPS
     steps, at_rest = first, False
+    drifts: Array = np.empty(0)
     while steps < _MOST_STEPS and not at_rest and (steps == first or may_go_on(steps)):
-        errors, slopes, drifts = rows.linearised(unknowns)
+        errors, slopes = rows.linearised(unknowns)
+        if steps in (first, _FIRST_STEPS):  # they change by shares of a per cent with the matrix
+            drifts = rows.drifts(unknowns)
         errors = rows.without_nuisances(errors, drifts, weights[:, None] * rows.precisions(excess))
         if steps >= _FIRST_STEPS:
             excess = rows.excess(errors, weights)
@@ -231,7 +234,7 @@ def estimate(
     root[: matrix.size, : problem.root.shape[1]] = problem.root
     for number, unknown in enumerate(problem.unknowns):
         root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
-    information = information - rows.bent(errors, slopes, weights, excess, loss)
+    information = rows.curvature(errors, slopes, drifts, weights, excess, loss)
     kinds = dict(zip(rows.kinds, excess.tolist(), strict=True))
     return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps - first, at_rest)
 
@@ -284,81 +287,83 @@ class _Rows:
             in_runs = np.bincount(self.run[of_kind.any(axis=1)], minlength=len(problem.runs))
             self._together[of_kind] = np.broadcast_to(in_runs[self.run][:, None], of_kind.shape)[of_kind]
 
-    def linearised(self, unknowns: Array) -> tuple[Array, Array, Array]:
-        """Errors (S, 3), their derivatives (S, 3, k) by the unknowns, and (S, 3, m) by the m nuisances in deviations.
-
-        What was not measured is 0.
-        """
+    def linearised(self, unknowns: Array) -> tuple[Array, Array]:
+        """Errors (S, 3) and their derivatives (S, 3, k) by the unknowns; 0 for what was not measured."""
         problem, count = self._problem, self._problem.root.shape[1]
-        matrix, terms = problem.answer(unknowns)
-        errors, jacobian, drifts = self._of_model(matrix, terms)
+        errors, jacobian = self._of_model(*problem.answer(unknowns), slopes=True)
         columns = [jacobian @ problem.root]
         for number in range(len(problem.unknowns)):
             moved = unknowns.copy()
             moved[count + number] += _STEP
-            further, _, _ = self._of_model(*problem.answer(moved), slopes=False)
+            further, _ = self._of_model(*problem.answer(moved), slopes=False)
             columns.append(((further - errors) / _STEP)[..., None])
         offsets = unknowns[count + len(problem.unknowns) :]
-        return errors + self._offsets @ offsets, np.concatenate([*columns, self._offsets], axis=2), drifts
+        return errors + self._offsets @ offsets, np.concatenate([*columns, self._offsets], axis=2)
 
-    def _of_model(self, matrix: Array, terms: Sequence[Term], *, slopes: bool = True) -> tuple[Array, Array, Array]:
-        """Errors (S, 3) by a matrix (3, M) and effects, and their derivatives by the matrix elements and nuisances."""
-        problem = self._problem
-        errors, jacobians, drifts = list[Array](), list[Array](), list[Array]()
-        acting = [term for term in terms if any(term.values.values())]
-        number = 0
-        for part in together([problem.runs[index] for index in self._posed]):
-            chosen = self._chosen[number : number + len(part)]
-            number += len(part)
-            driven = corrected_runs(problem.robot, part, acting, problem.sample_period) if acting else part
-            logs = [run.log(run.pose_times[index]) for run, (index, _) in zip(driven, chosen, strict=True)]
-            odometry = OdometryBatch(logs, problem.integration)
+    def drifts(self, unknowns: Array) -> Array:
+        """Derivatives (S, 3, m) of the errors by the nuisances that are estimated, in their deviations."""
+        deviations = self._problem.nuisances.deviations
+        used, stretches = deviations > 0, list[Array]()
+        if not used.any():
+            return np.zeros((len(self.run), 3, 0))
+        matrix, terms = self._problem.answer(unknowns)
+        for logs, firsts, _ in self._driven(terms):
+            odometry = OdometryBatch(logs, self._problem.integration)
+            poses, stamps = odometry.poses(matrix[None])[0], np.concatenate([log.stamps for log in logs])
+            path = poses - np.array([log.start for log in logs])[odometry.trajectory]
+            turned, velocity = np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1), np.zeros(poses.shape)
+            if used[1:].any():
+                # Differences over two samples: the rate of a single one has its full encoder noise
+                period = self._problem.sample_period
+                shifted = (
+                    [replace(log, stamps=log.stamps + by).continued(float(log.stamps[-1] + by)) for log in logs]
+                    for by in (period, -period)
+                )
+                late, early = (
+                    OdometryBatch(each, self._problem.integration).poses(matrix[None])[0] for each in shifted
+                )
+                velocity = (late - early) / (2 * period)
+            columns = np.stack([turned, -velocity, -velocity * stamps[:, None]], axis=2) * deviations
+            stretches.append(_means(columns[..., used], firsts))
+        others = len(self.run) - sum(map(len, stretches))
+        return np.concatenate([*stretches, np.zeros((others, 3, int(used.sum())))])
+
+    def _of_model(self, matrix: Array, terms: Sequence[Term], *, slopes: bool) -> tuple[Array, Array]:
+        """Errors (S, 3) by a matrix (3, M) and effects, and their derivatives (S, 3, 3M) by its elements, if wanted."""
+        errors, jacobians = list[Array](), list[Array]()
+        for logs, firsts, seen in self._driven(terms):
+            odometry = OdometryBatch(logs, self._problem.integration)
             poses = odometry.poses(matrix[None])[0]
-            seen = np.concatenate([run.poses[index] for run, (index, _) in zip(part, chosen, strict=True)])
-            starts = np.cumsum([0, *(len(index) for index, _ in chosen)])
-            firsts = np.concatenate([first + start for (_, first), start in zip(chosen, starts, strict=False)])
-            counts = np.diff([*firsts, len(poses)])[:, None, None]
             errors += [np.median(stretch, axis=0) for stretch in np.split(poses - seen, firsts[1:])]
             if slopes:
-                jacobian = odometry.jacobian(matrix).reshape(len(poses), 3, -1)
-                jacobians.append(np.add.reduceat(jacobian, firsts, axis=0) / counts)
-                drifts.append(np.add.reduceat(self._drifts(logs, poses, matrix), firsts, axis=0) / counts)
+                jacobians.append(_means(odometry.jacobian(matrix).reshape(len(poses), 3, -1), firsts))
         if self._references is not None:
-            rows = self._references
-            if acting:
-                rows = replace(rows, runs=corrected_runs(problem.robot, rows.runs, acting, problem.sample_period))
-            batch = ReferenceBatch(rows, problem.integration)
+            rows = replace(self._references, runs=self._corrected(self._references.runs, terms))
+            batch = ReferenceBatch(rows, self._problem.integration)
             predicted = batch.poses(matrix[None])[0]
             errors += list(np.where(rows.measured, predicted - rows.observed, 0.0))
             if slopes:
                 jacobian = batch.jacobian(matrix).reshape(len(predicted), 3, -1)
                 jacobians.append(np.where(rows.measured[..., None], jacobian, 0.0))
-                drifts.append(np.zeros((len(predicted), 3, np.count_nonzero(problem.nuisances.deviations))))
-        if not slopes:
-            return np.array(errors), np.empty(0), np.empty(0)
-        return np.array(errors), np.concatenate(jacobians), np.concatenate(drifts)
+        return np.array(errors), np.concatenate(jacobians) if slopes else np.empty(0)
 
-    def _drifts(self, logs: Sequence[WheelLog], poses: Array, matrix: Array) -> Array:
-        """Derivatives (K, 3, m) of poses (K, 3) by the nuisances that are estimated, in their deviations."""
-        deviations = self._problem.nuisances.deviations
-        if not deviations.any():
-            return np.zeros((*poses.shape, 0))
-        path = poses - np.repeat([log.start for log in logs], [len(log.stamps) for log in logs], axis=0)
-        turned = np.stack([-path[:, 1], path[:, 0], np.ones(len(path))], axis=1)
-        stamps, velocity = np.concatenate([log.stamps for log in logs]), np.zeros(poses.shape)
-        if deviations[1:].any():
-            # Differences over two samples: the rate of a single one has its full encoder noise
-            period = self._problem.sample_period
-            late, early = (
-                OdometryBatch(
-                    [replace(log, stamps=log.stamps + shift).continued(float(log.stamps[-1] + shift)) for log in logs],
-                    self._problem.integration,
-                ).poses(matrix[None])[0]
-                for shift in (period, -period)
-            )
-            velocity = (late - early) / (2 * period)
-        columns = np.stack([turned, -velocity, -velocity * stamps[:, None]], axis=2) * deviations
-        return np.asarray(columns[..., deviations > 0])
+    def _driven(self, terms: Sequence[Term]) -> Iterator[tuple[list[WheelLog], NDArray[np.intp], Array]]:
+        """The logs of runs with poses, corrected by effects, a part at a time; with each part the indices of its
+        stretches' first poses, and the reference poses (K, 3)."""
+        number = 0
+        for part in together([self._problem.runs[index] for index in self._posed]):
+            chosen = self._chosen[number : number + len(part)]
+            number += len(part)
+            seen = np.concatenate([run.poses[index] for run, (index, _) in zip(part, chosen, strict=True)])
+            starts = np.cumsum([0, *(len(index) for index, _ in chosen)])
+            firsts = np.concatenate([first + start for (_, first), start in zip(chosen, starts, strict=False)])
+            driven = self._corrected(part, terms)
+            yield [run.log(run.pose_times[index]) for run, (index, _) in zip(driven, chosen, strict=True)], firsts, seen
+
+    def _corrected(self, runs: Sequence[Trajectory], terms: Sequence[Term]) -> tuple[Trajectory, ...]:
+        acting = [term for term in terms if any(term.values.values())]
+        problem = self._problem
+        return corrected_runs(problem.robot, runs, acting, problem.sample_period) if acting else tuple(runs)
 
     def excess(self, errors: Array, weights: Array) -> Array:
         """w of Eq. (4) by kind, of errors (S, 3) with the loss's weights (S,)."""
@@ -403,15 +408,24 @@ class _Rows:
             information = information - np.swapaxes(along, 1, 2) @ np.linalg.solve(inner, along)
         return information, scores
 
-    def bent(self, errors: Array, slopes: Array, weights: Array, excess: Array, loss: Loss) -> Array:
-        """What curvature (Z, k, k) the runs lack where the loss is no parabola: x h'(x) along each row's error."""
+    def curvature(
+        self, errors: Array, slopes: Array, drifts: Array, weights: Array, excess: Array, loss: Loss
+    ) -> Array:
+        """Hessians (Z, k, k) of half of the runs' parts of Eq. (3), nuisances eliminated.
+
+        A row lacks x h'(x) of its weight along its error, where the loss is no parabola: of itself and of nuisances.
+        """
         ratios = np.sqrt(np.nansum(np.square(errors) / self.variances(excess), axis=1))
-        lost = -loss.slopes(ratios) / loss.weights(np.zeros(1))
-        scaled = errors * np.sqrt(self.precisions(excess))
+        lost = np.clip(-loss.slopes(ratios) / loss.weights(np.zeros(1)), 0.0, weights)
+        roots = np.sqrt(self.precisions(excess))
+        scaled = errors * roots
         units = scaled / np.maximum(np.linalg.norm(scaled, axis=1), np.finfo(float).tiny)[:, None]
-        along = np.einsum("sci,sc->si", slopes * np.sqrt(self.precisions(excess))[..., None], units)
-        assert weights.shape == lost.shape
-        return self._by_run(lost[:, None, None] * along[:, :, None] * along[:, None, :])
+        whole, count = np.concatenate([slopes, drifts], axis=2) * roots[..., None], slopes.shape[2]
+        along = np.einsum("sci,sc->si", whole, units) * np.sqrt(lost)[:, None]
+        weighted = np.einsum("sci,scj->sij", whole * weights[:, None, None], whole)
+        sums = self._by_run(weighted - along[:, :, None] * along[:, None, :])
+        inner, beside = sums[:, count:, count:] + np.eye(drifts.shape[2]), sums[:, count:, :count]
+        return sums[:, :count, :count] - np.swapaxes(beside, 1, 2) @ np.linalg.solve(inner, beside)
 
     def _of_nuisances(self, drifts: Array, precisions: Array, slopes: Array) -> tuple[Array, Array]:
         """1 + N'PN (Z, m, m) and N'P J (Z, m, k) for the columns N of nuisances and J of others."""
@@ -424,6 +438,12 @@ class _Rows:
         sums = np.zeros((len(self._problem.runs), *values.shape[1:]))
         np.add.at(sums, self.run, values)
         return sums
+
+
+def _means(values: Array, firsts: NDArray[np.intp]) -> Array:
+    """Means (S, ...) of values (K, ...) over stretches that begin at ``firsts``."""
+    counts = np.diff([*firsts, len(values)]).reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values, firsts, axis=0) / counts)
 
 
 def _chosen(poses: int, stretches: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

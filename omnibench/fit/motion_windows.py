@@ -1,4 +1,4 @@
-"""Motion in windows of runs: what training along the integrated path compares, by NumPy or JAX.
+"""Motion in windows of runs: what training along the integrated path compares, by NumPy or JAX; and windows as runs.
 
 Runs are cut into steps over which the drive signals are averaged, and poses of the reference at the steps' edges are
 taken in pairs, the windows. The motion in a window is its last pose seen from its first one.
@@ -6,8 +6,8 @@ taken in pairs, the windows. The motion in a window is its last pose seen from i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -103,3 +103,36 @@ def _pairs(times: Array, length: float) -> list[tuple[int, int]]:
     firsts = np.searchsorted(times, np.arange(0.0, times[-1] - length + 1e-6, length / 2) - 1e-6)
     lasts = np.searchsorted(times, times[firsts] + length - 1e-6)
     return [pair for pair in zip(firsts.tolist(), lasts.tolist(), strict=True) if pair[1] < len(times)]
+
+
+def windows_of(run: Trajectory, count: int) -> Iterator[Trajectory]:
+    """So many parts of a run, which begin and end at reference poses."""
+    if count == 1:
+        yield run
+        return
+    wanted = np.linspace(0.0, run.end, count + 1)
+    edges = np.unique(np.clip(np.searchsorted(run.pose_times, wanted), 0, len(run.pose_times) - 1))
+    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        begin, end = float(run.pose_times[first]), float(run.pose_times[last])
+        driven = slice(*np.searchsorted(run.times, [begin, end], side="right").tolist())
+        driven = slice(driven.start, min(driven.stop + 1, len(run.times)))
+        if last - first <= 1 or driven.stop <= driven.start:
+            continue
+        seen = slice(first, last + 1)
+        fields = {
+            name: value[driven]
+            for name in ("rates", "angles", "targets", "steering", "odometry")
+            if (value := getattr(run, name)) is not None
+        }
+        yield replace(
+            run,
+            id=f"{run.id} ({begin:.1f} to {end:.1f} s)",
+            times=run.times[driven] - begin,
+            pose_times=run.pose_times[seen] - begin,
+            poses=run.poses[seen],
+            pose_covariances=None if run.pose_covariances is None else run.pose_covariances[seen],
+            started_at=None if run.started_at is None else run.started_at + begin,
+            command=None,
+            sent=None,
+            **fields,
+        )

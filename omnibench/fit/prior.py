@@ -66,10 +66,11 @@ def default_mount(robot: Robot) -> MountChoice:
     return "fit" if class_of(robot) in _UNKNOWN_MOUNTS else "known"
 
 
-def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
+def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: MountChoice | None = None) -> Array:
     """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 
-    Rows that no wheel drives (the sideways one of a robot that cannot slide) move with the tracked point alone.
+    mount: whether the tracked point may stand elsewhere; default: as is usual for the robot. Rows that no wheel drives
+    (the sideways one of a robot that cannot slide) move with the tracked point alone.
     """
     design, scales = robot.inverse_kinematic_matrix, robot.row_scales
     columns = _wheels_of_columns(robot)
@@ -88,9 +89,10 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance) -> Array:
             roots.append(turned * STEERING_ZERO)
     if class_of(robot) == "skid":
         roots += [*(TURNING_CENTRE * changes_by_centre(robot))]
-    if default_mount(robot) == "fit" and not robot.slides:
+    if (mount or default_mount(robot)) == "fit":
         x, y, _ = design
-        roots += [*(TRACKED_POINT * changes_by_centre(robot)), TRACKED_YAW * np.array([y, -x, np.zeros_like(x)])]
+        roots += [*(TRACKED_POINT * changes_by_centre(robot))]
+        roots += [] if robot.slides else [TRACKED_YAW * np.array([y, -x, np.zeros_like(x)])]
     return np.array([root.ravel() for root in roots]).T
 
 

@@ -13,6 +13,7 @@ import plotly.graph_objects as go
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.fit.evaluate import final_errors, positions_and_headings
+from omnibench.fit.path_errors import PathError, predicted_errors
 from omnibench.report import blocks as page
 from omnibench.report.figures import marks
 from omnibench.report.numbers import NOTHING, fixed, percent, significant, typeset
@@ -65,6 +66,7 @@ def calibration_document(
                 (_motion_figure(by_motion), _motion_table(by_motion)),
                 about=f"Errors of the final pose of the {which} runs, by what the robot drove.",
             ),
+            *_paths(calibration),
             page.Section("matrix", "The matrix", (_matrix_table(calibration),), folded=True, about="What is computed."),
             page.Section(
                 "origin", "How it was made", (_facts(calibration, verdict),), folded=True, about="Data, fit, versions."
@@ -72,6 +74,14 @@ def calibration_document(
         ),
         badges=page.simulated_badge(dataset.simulated),
     )
+
+
+def _paths(calibration: Calibration) -> tuple[page.Section, ...]:
+    """What the robot will do on usual paths; nothing where no covariance tells."""
+    errors = predicted_errors(calibration)
+    about = "Expected errors at the end, from the calibration's uncertainty and the slip that its runs showed."
+    table = path_table(errors, calibration)
+    return (page.Section("paths", "What to expect on other paths", (table,), about=about),) if errors else ()
 
 
 def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
@@ -97,6 +107,29 @@ def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
     heading = title.replace(" ", "\N{NO-BREAK SPACE}") if 0 < len(title) <= _HEADING else "parameter"
     caption = title if len(title) > _HEADING else ""
     return page.Table(caption, (page.Column(heading, numeric=False), *headings), tuple(rows))
+
+
+def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Table:
+    """The errors to expect at the ends of paths, by the design and by the calibration, with what holds 95 % of them."""
+    rows = []
+    for path in dict.fromkeys(error.path for error in errors):
+        by_model = {error.model: error for error in errors if error.path == path}
+        both = (by_model["design"], by_model["calibration"])
+        places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
+        turns = (f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both)
+        rows.append(page.Row.of(path, *places, *turns))
+    columns = (
+        page.Column("path", numeric=False),
+        *(page.Column(f"position, {model}", "mm") for model in ("design", "calibration")),
+        *(page.Column(f"heading, {model}", "deg") for model in ("design", "calibration")),
+    )
+    runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
+    return page.Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows))
+
+
+def _figures(value: float) -> str:
+    """A number with two figures, or all before its point."""
+    return f"{value:.1f}" if value < 10 else f"{value:.0f}"
 
 
 def _tiles(errors: Sequence[Array], verdict: HeldOutVerdict) -> tuple[page.Fact, ...]:

@@ -61,6 +61,18 @@ _Parameters = Annotated[
 ]
 
 
+class Slip(config.Model):
+    """Scatter of the ends of training runs about the calibrated odometry, which no calibration takes away.
+
+    Standard deviations per root metre that the wheels roll; see fit/path_errors.py.
+    """
+
+    heading: Deviation = Field(description="of the heading, rad")
+    way: Deviation = Field(description="of the part of that which turns the robot on its way, rad")
+    position: Deviation = Field(description="of the place, beside what that turns, m")
+    runs: int = Field(ge=1, description="number of training runs that tell it")
+
+
 class EffectTerm(config.Model):
     """An effect by its name, with the values of its parameters."""
 
@@ -219,6 +231,7 @@ class Calibration(Shown, config.Model):
     )
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
+    slip: Slip | None = Field(None, description="by which runs scatter about the odometry", exclude_if=_is_none)
     session: config.Name | None = Field(None, description="what drift terms are measured from")
     driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"

@@ -22,10 +22,11 @@ pose with its counterpart, by NumPy's rules of broadcasting.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import chain
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -53,6 +54,9 @@ _FORWARD = 0.0  # rad, the direction of rolling where none is given
 _FARTHEST = 1e3  # m
 _ON_AN_AXIS = 1e-9  # m2: a wheel ahead of the centre, or beside it, may have its rollers either way
 
+# Largest steering angles where none is given, deg (chosen): a tricycle's front wheel nearly reaches the turn on the
+# spot, a car's wheels 30 to 40 deg; any other module drives backward in the place of turning further than 90.
+STEERING_LIMITS: Mapping[RobotClass, float] = MappingProxyType({"tricycle": 80.0, "car": 35.0})
 FASTEST = 100.0  # rad/s; chosen, above the wheels of usual robots
 FASTEST_RIM = 5.0  # m/s, of small wheels, which turn faster; chosen
 

@@ -155,7 +155,7 @@ def read_matrix(
 
     covariance: of the elements, row by row, and of the effects' parameters, or of the elements alone; intervals are by
     Student's t with these degrees of freedom of the variances, one for all or one for each. fitted_mount: the tracked
-    point of a robot that slides may stand elsewhere than its file says; of others it always may. unknown (q, 3M):
+    point may stand elsewhere than the robot's file says, and its place is among the parameters. unknown (q, 3M):
     changes of the matrix of which the data say nothing; parameters that depend on them have no interval.
     """
     factors = _factors_of_effects(robot, effects)
@@ -208,16 +208,10 @@ def read_matrix(
     parameters = []
     for (name, design), value, half in zip(model.design.items(), values.tolist(), reach.tolist(), strict=True):
         low, high = (None, None) if math.isnan(half) else (value - half, value + half)
-        each = PhysicalParameter(name=name, design=design, value=value, unit=unit_of(name), low=low, high=high)
-        if not _is_known(robot, each):
-            parameters.append(each)
+        parameters.append(
+            PhysicalParameter(name=name, design=design, value=value, unit=unit_of(name), low=low, high=high)
+        )
     return PhysicalReading(tuple(parameters), _doubt(robot, parameters, fitted_mount))
-
-
-def _is_known(robot: Robot, parameter: PhysicalParameter) -> bool:
-    """True for the pose of a tracked point that is the robot's centre, and that the matrix was not free to move."""
-    here = robot.mount is None and parameter.low is None and abs(parameter.deviation) <= _NO_VARIANCE
-    return here and parameter.name.startswith("mount")
 
 
 def _split(slopes: Array) -> tuple[Array, Array]:
@@ -366,13 +360,15 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
         changes = {"offset": STEERING_ZERO / len(robot.drive.steered)} if car else {f"offset_{owner}": STEERING_ZERO}
         columns.append((changes, {name: STEERING_ZERO}))
 
-    # The tracked point. If all wheels slide, it stands where the file says or is fitted, and its yaw is their angles'.
+    # The tracked point. Where all wheels slide it could be anywhere, by other distances, and its yaw is the angles':
+    # there it stands where the file says, unless it is fitted.
     mount = {"mount_x": TRACKED_POINT, "mount_y": TRACKED_POINT, "mount_yaw": TRACKED_YAW}
     if robot.slides and not robot.skid:
         mount = {name: TRACKED_POINT for name in ("mount_x", "mount_y") if fitted_mount}
     for name, deviation in mount.items():
-        design[name] = at_design[name]
-        columns.append(({name: deviation}, {name: deviation}))
+        if fitted_mount:
+            design[name] = at_design[name]
+        columns.append(({name: deviation}, {name: deviation} if fitted_mount else {}))
 
     for name in of_effects:
         design.setdefault(name, 1.0 if name.startswith("steering_gain") else at_design.get(name, 0.0))

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.robot.kinematics import Array, Robot, class_of
+from omnibench.robot.kinematics import STEERING_LIMITS, Array, Robot, class_of
 from omnibench.simulate.mechanics import TrueMotion
 
-# Largest steering angles where none is given, deg (chosen): a tricycle's front wheel nearly reaches the turn on the
-# spot, a car's wheels 30 to 40 deg; any other module drives backward in the place of turning further than 90.
-_LIMITS, _LARGEST = {"tricycle": 80.0, "car": 35.0}, 90.0
+_LARGEST = 90.0  # deg, of other steering than STEERING_LIMITS names
 _DIGITS = 9  # of a pivot, m, and a direction, deg: the rest is rounding
 _SLACK = 1e-6  # rad, and relative to the signals: rounding of what lies on a limit
 _EVERY_WAY = tuple(float(degrees) for degrees in range(0, 360, 45))
@@ -72,7 +70,7 @@ def default_directions(robot: Robot) -> tuple[float, ...]:
 def steering_limit(robot: Robot, degrees: float | None) -> float:
     """The largest steering angle, rad: as given in degrees, or the default of the robot's type."""
     if degrees is None:
-        degrees = _LIMITS.get(class_of(robot), _LARGEST)
+        degrees = STEERING_LIMITS.get(class_of(robot), _LARGEST)
     return math.radians(degrees)
 
 

@@ -44,7 +44,7 @@ def document(printed: Printed) -> Any:
 
 def test_evaluate_prints_the_documented_document(command: Command, prepared: Prepared) -> None:
     found = document(command("evaluate", prepared.calibration, prepared.data, "--json"))
-    assert [*found] == ["dataset", "trajectories", "splits", "held_out", "sessions", "warnings"]
+    assert [*found] == ["dataset", "trajectories", "splits", "held_out", "sessions", "warnings", "paths"]
     assert found["warnings"] == []
     assert (found["dataset"], found["trajectories"]) == ("flower", 12)
     assert [*found["splits"]] == ["train", "validation", "all"]
@@ -63,6 +63,47 @@ def test_evaluate_shows_the_design_values_and_how_many_runs_were_held_out(comman
     assert [line for line in shown.splitlines() if ": 6 runs" in line or ": 12 runs" in line] == [
         *("train: 6 runs, none held out", "validation: 6 runs, all held out", "all: 12 runs, 6 held out")
     ]
+
+
+def test_evaluate_predicts_the_errors_on_usual_paths_and_on_those_that_are_named(
+    command: Command, prepared: Prepared
+) -> None:
+    keys = ["path", "model", "position_m", "position_95_m", "heading_rad", "heading_95_rad"]
+    usual = document(command("evaluate", prepared.calibration, prepared.data, "--json"))["paths"]
+    assert [*dict.fromkeys(each["path"] for each in usual)] == [
+        *("straight 1.0", "turn 360", "circle 1.0 left", "square 1.0 left")
+    ]
+    named = command("evaluate", prepared.calibration, "--path", "circle 0.5 right", "--path", "turn 90", "--json")
+    found = document(named)
+    assert [*found] == ["paths", "warnings"]
+    assert [(each["path"], each["model"]) for each in found["paths"]] == [
+        (path, model) for path in ("circle 0.5 right", "turn 90") for model in ("calibration", "design")
+    ]
+    for each in [*usual, *found["paths"]]:
+        assert [*each] == keys
+        assert 0 < each["position_m"] < each["position_95_m"]
+        assert 0 < each["heading_rad"] < each["heading_95_rad"]
+
+
+def test_evaluate_shows_a_table_of_paths(command: Command, prepared: Prepared) -> None:
+    printed = succeeded(command("evaluate", prepared.calibration, "--path", "square 2.0 right"))
+    assert "errors to expect at a path's end (95 % lie within); slip as of 6 training runs" in printed.stdout
+    assert any(line.startswith("square 2.0 right") for line in printed.stdout.splitlines())
+    assert "evaluate" in printed.stderr
+    wrong = command("evaluate", prepared.calibration, "--path", "sqare 1.0")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert "did you mean 'square 1.0 left'" in wrong.stderr
+
+
+def test_a_calibration_of_an_older_version_says_what_its_regions_lack(
+    command: Command, prepared: Prepared, tmp_path: Path
+) -> None:
+    old = read_calibration(prepared.calibration).model_copy(update={"slip": None})
+    write_calibration(old, tmp_path / "old.yaml")
+    assert "slip" not in (tmp_path / "old.yaml").read_text()
+    found = document(command("evaluate", tmp_path / "old.yaml", "--json"))
+    assert ["uncertainty alone" in warning for warning in found["warnings"]] == [True]
+    assert len(found["paths"]) == 8
 
 
 def test_calibrate_prints_what_it_would_write(command: Command, prepared: Prepared, tmp_path: Path) -> None:
@@ -89,9 +130,10 @@ def test_calibrate_and_evaluate_end_with_what_held_out_runs_say(command: Command
 
 
 def test_what_only_a_live_node_can_run_is_not_exported(command: Command, prepared: Prepared, tmp_path: Path) -> None:
-    plain = read_calibration(prepared.calibration)
-    term = EffectTerm(name="wheel_dead_zone", parameters={"c": -0.001})
-    write_calibration(plain.model_copy(update={"effects": (term,), "covariance": None}), tmp_path / "effects.yaml")
+    fitted = read_calibration(prepared.calibration)
+    term = EffectTerm(name="centripetal_slip", parameters={"k": -0.001})
+    effects = {"effects": (term,), "covariance": None, "plain": None}
+    write_calibration(fitted.model_copy(update=effects), tmp_path / "effects.yaml")
     ending = command("evaluate", tmp_path / "effects.yaml", prepared.data).stderr
     assert ending.endswith(":\n  omnibench guide live\n")
     assert " export " in command("evaluate", prepared.calibration, prepared.data).stderr

@@ -389,6 +389,7 @@ def test_the_default_folder_has_the_name_of_the_data_and_the_newest_is_linked(co
 
 def test_a_mistake_is_refused_before_any_work(command: Command, told: Told, data: Path) -> None:
     plain = (told.folder / "plain.yaml").read_text(encoding="utf-8")
+    assert "\nslip:" in plain  # so that evaluate predicts its errors on paths
     Path("other.yaml").write_text(plain.replace("{name: ", "{name: w"), encoding="utf-8")
     Path("mine").mkdir()
     Path("mine/notes.txt").write_text("mine", encoding="utf-8")

@@ -459,7 +459,7 @@ def test_a_robust_loss_is_better_without_jumps_and_is_said(squares: ComparisonRe
 
 def test_answer_and_warning_are_those_of_calibrate(squares: ComparisonResult, huber: ComparisonResult) -> None:
     dataset: Dataset = huber.datasets["jumping"]
-    alone = calibrate(dataset, loss="huber", cost="final_pose", unidentified="keep")
+    alone = calibrate(dataset, "closed_form", loss="huber", cost="final_pose")
     np.testing.assert_array_equal(np.array(huber.runs[1].record.matrix), alone.calibration.matrix)
     (of_calibrate,) = (warning for warning in alone.warnings if "beside it say" in warning)
     assert far_ends(huber) == [f"data set jumping: {of_calibrate}"]

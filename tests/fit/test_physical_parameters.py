@@ -82,15 +82,23 @@ OMNI = APR_02.model_copy(
 MARKER = Mount(x=0.02, y=0.03)
 
 
-def test_a_marker_36_mm_off_the_centre_of_three_omni_wheels_leaves_their_distances_as_they_are() -> None:
+@pytest.mark.parametrize("calibrator", ["map", "closed_form"])
+def test_a_marker_36_mm_off_the_centre_of_three_omni_wheels_leaves_their_distances_as_they_are(calibrator: str) -> None:
     seen = recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)
-    known, fitted = named(calibrate(seen)), named(calibrate(seen, mount="fit"))
-    assert not is_inside(known["distance_b"], 0.155)  # the marker counts as wheels that stand elsewhere
-    for found in (fitted, named(calibrate(make_dataset("d", declared(), PERIOD, seen.trajectories)))):
+    fitted = named(calibrate(seen, calibrator, mount="fit"))
+    for found in (fitted, named(calibrate(make_dataset("d", declared(), PERIOD, seen.trajectories), calibrator))):
         assert all(is_inside(found[f"distance_{wheel}"], 0.155) for wheel in "abc")
     assert is_inside(fitted["mount_x"], 0.02)
     assert is_inside(fitted["mount_y"], 0.03)
-    assert "mount_x" not in known
+    assert fitted["mount_y"].low > 0.01
+    assert "mount_x" not in named(calibrate(seen, calibrator))
+
+
+def test_the_tracked_point_of_two_wheels_is_fitted_where_that_is_asked_for() -> None:
+    point = Mount(x=-0.015, y=0.01, yaw=0.02)
+    found = named(calibrate(recording(DIFFERENTIAL, point.twist @ DIFFERENTIAL.inverse_kinematic_matrix), mount="fit"))
+    truth = {"mount_x": point.x, "mount_y": point.y, "mount_yaw": point.yaw, "track": 0.3, "radius_left": 0.05}
+    assert all(is_inside(found[name], value) for name, value in truth.items())
 
 
 def declared() -> Robot:
@@ -98,13 +106,11 @@ def declared() -> Robot:
 
 
 def test_a_fitted_mount_is_in_the_file_and_an_attribute() -> None:
-    run = calibrate(recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix), mount="fit")
+    seen = recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)
+    run = calibrate(seen, "closed_form", mount="fit")
     assert run.calibration.provenance.mount == "fit"
     assert math.hypot(run.calibration.mount.x - 0.02, run.calibration.mount.y - 0.03) < 0.002
-    assert (
-        run.calibration.matrix
-        == calibrate(recording(OMNI, MARKER.twist @ OMNI.inverse_kinematic_matrix)).calibration.matrix
-    )
+    assert run.calibration.matrix == calibrate(seen, "closed_form").calibration.matrix
 
 
 def test_wrong_lengths_are_doubted_in_one_line() -> None:
@@ -119,7 +125,7 @@ def test_wrong_lengths_are_doubted_in_one_line() -> None:
 
 def test_runs_without_turns_leave_the_distances_without_interval() -> None:
     data = make_dataset("ring", synthetic_robot(), 0.1, rolled(RING, slip=0.02))
-    found = named(calibrate(data))
+    found = named(calibrate(data, "closed_form"))
     assert [name for name, each in found.items() if each.low is None] == ["distance_a", "distance_b", "distance_c"]
 
 

@@ -18,7 +18,14 @@ def test_the_report_answers_first_and_shows_paths_parameters_and_errors_by_motio
     assert run.calibration.provenance is not None
     assert run.calibration.provenance.held_out is not None
     document = calibration_document(run.calibration, dataset, run.calibration.provenance.held_out, run.warnings)
-    assert [section.key for section in document.sections] == ["answer", "parameters", "motions", "matrix", "origin"]
+    assert [section.key for section in document.sections] == [
+        "answer",
+        "parameters",
+        "motions",
+        "paths",
+        "matrix",
+        "origin",
+    ]
     answer = document.sections[0]
     assert [type(block) for block in answer.blocks[:3]] == [page.Paragraph, page.Facts, page.FigureGrid]
     table = next(block for block in document.sections[1].blocks if isinstance(block, page.Table))

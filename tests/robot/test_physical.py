@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,7 +68,8 @@ def inside(parameter: PhysicalParameter, truth: float) -> bool:
 
 @pytest.mark.parametrize("robot", [APR_02, *WHEELED], ids=lambda robot: robot.name)
 def test_the_design_has_the_parameters_of_its_class(robot: Robot) -> None:
-    design = read_matrix(robot, robot.inverse_kinematic_matrix, scattered(robot))
+    mounted = "mount_x" in NAMES[robot.name]
+    design = read_matrix(robot, robot.inverse_kinematic_matrix, scattered(robot), fitted_mount=mounted)
     assert list(values(design)) == NAMES[robot.name]
     assert all(each.value == pytest.approx(each.design, abs=1e-12) for each in design.parameters)
     assert all(inside(each, each.design) for each in design.parameters)
@@ -93,7 +95,7 @@ def test_the_radii_and_the_track_of_two_wheels_come_back(
 ) -> None:
     changes = {"radius_left": 0.05 * left, "radius_right": 0.05 * right, "mount_x": x, "mount_y": y, "mount_yaw": yaw}
     matrix = matrix_of(DIFFERENTIAL, changes | {"distance_left": -0.15 * track, "distance_right": 0.15 * track})
-    found = {each.name: each.deviation for each in read_matrix(DIFFERENTIAL, matrix).parameters}
+    found = {each.name: each.deviation for each in read_matrix(DIFFERENTIAL, matrix, fitted_mount=True).parameters}
     expected = changes | {"track": 0.3 * track}
     assert {name: found.get(name, 0.0) for name in expected} == pytest.approx(expected, abs=1e-9)
 
@@ -106,7 +108,7 @@ def test_radius_wheelbase_and_steering_zero_come_back(
     place = "wheelbase" if robot is CAR else "x_front"
     mount = {"mount_x": x, "mount_y": y, "mount_yaw": yaw}
     matrix = matrix_of(robot, mount | {"radius*": 0.05 * radius, place: 0.5 * wheelbase, "offset*": zero})
-    for each in read_matrix(robot, matrix).parameters:
+    for each in read_matrix(robot, matrix, fitted_mount=True).parameters:
         expected = {"radius": 0.05 * radius, "wheelbase": 0.5 * wheelbase, "steering": zero}
         change = mount.get(each.name, expected.get(each.name.partition("_")[0]))
         assert each.deviation == pytest.approx(change, abs=1e-9)
@@ -118,7 +120,7 @@ def test_a_skid_steered_base_has_one_effective_track(left: float, right: float, 
                for end in ("front", "rear")}  # fmt: skip
     moved = {f"distance_{end}_{side}": sign * 0.15 * track for side, sign in (("left", -1), ("right", 1))
              for end in ("front", "rear")}  # fmt: skip
-    reading = read_matrix(SKID, matrix_of(SKID, changes | moved | {"mount_y": y}))
+    reading = read_matrix(SKID, matrix_of(SKID, changes | moved | {"mount_y": y}), fitted_mount=True)
     found = {each.name: each.deviation for each in reading.parameters}
     expected = changes | {"track": 0.3 * track, "mount_y": y}
     assert {name: found.get(name, 0.0) for name in expected} == pytest.approx(expected, abs=1e-9)
@@ -179,12 +181,23 @@ def test_a_declared_mount_is_taken_out_of_every_robot(robot: Robot) -> None:
     assert all(each.value == pytest.approx(each.design, abs=1e-9) for each in reading.parameters)
 
 
-def test_a_tracked_point_that_could_not_move_is_not_among_the_parameters_of_two_wheels() -> None:
+def test_the_tracked_point_of_two_wheels_is_among_the_parameters_where_it_is_fitted_and_moves_no_other() -> None:
+    seen = MARKER.twist @ DIFFERENTIAL.inverse_kinematic_matrix
+    known, fitted = (values(read_matrix(DIFFERENTIAL, seen, fitted_mount=mount)) for mount in (False, True))
+    assert list(known) == ["radius_left", "radius_right", "track"]
+    assert (
+        {name: fitted[name] for name in known}
+        == known
+        == pytest.approx({"radius_left": 0.05, "radius_right": 0.05, "track": 0.3}, abs=1e-9)
+    )
+    assert (fitted["mount_x"], fitted["mount_y"]) == pytest.approx((0.02, 0.03), abs=1e-9)
+
+
+def test_what_the_wheels_hold_has_no_interval() -> None:
     kept = scattered(DIFFERENTIAL)
     kept[2:4] = kept[:, 2:4] = 0.0  # row 2, which the wheels allow to be zero alone
-    reading = read_matrix(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, kept)
-    assert list(values(reading)) == ["radius_left", "radius_right", "track", "mount_y"]
-    assert all(inside(each, each.design) for each in reading.parameters)
+    reading = read_matrix(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, kept, fitted_mount=True)
+    assert [name for name, ends in intervals(reading).items() if None in ends] == ["mount_x", "mount_yaw"]
 
 
 # Intervals.
@@ -192,19 +205,19 @@ def test_a_tracked_point_that_could_not_move_is_not_among_the_parameters_of_two_
 
 @pytest.mark.parametrize("robot", [APR_02, DIFFERENTIAL, TRICYCLE], ids=lambda robot: robot.name)
 def test_intervals_carry_the_elements_covariance_by_the_slopes_of_the_reading(robot: Robot) -> None:
+    def read(matrix: Array, *scatter: Any) -> PhysicalReading:
+        return read_matrix(robot, matrix, *scatter, fitted_mount=robot is not APR_02)
+
     rng = np.random.default_rng(3)
     matrix = robot.inverse_kinematic_matrix * 1.01
     root = np.sqrt(scattered(robot)) @ rng.standard_normal((matrix.size, matrix.size))
-    reading = read_matrix(robot, matrix, root @ root.T, 7)
     step, slopes = 0.03, []
-    for direction in root.T:
-        ends = [np.array(list(values(read_matrix(robot, matrix + s * step * direction.reshape(matrix.shape))).values()))
-                for s in (-1, 1)]  # fmt: skip
-        slopes.append((ends[1] - ends[0]) / (2 * step))
+    for direction in root.T.reshape(-1, *matrix.shape):
+        low, high = (np.array(list(values(read(matrix + side * step * direction)).values())) for side in (-1, 1))
+        slopes.append((high - low) / (2 * step))
     expected = stdtrit(7, 0.975) * np.linalg.norm(slopes, axis=0)
-    names = list(values(read_matrix(robot, matrix + step * root[:, 0].reshape(matrix.shape))))
-    reach = {each.name: (each.high - each.low) / 2 for each in reading.parameters}
-    assert [reach[name] for name in names] == pytest.approx(list(expected), rel=1e-5)
+    reach = [(each.high - each.low) / 2 for each in read(matrix, root @ root.T, 7).parameters]
+    assert reach == pytest.approx(list(expected), rel=1e-5)
 
 
 def test_degrees_of_freedom_of_single_elements_are_weighted_by_their_shares() -> None:

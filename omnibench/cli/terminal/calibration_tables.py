@@ -17,9 +17,10 @@ from omnibench.errors import ConfigError
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
+from omnibench.fit.path_errors import PathError
 from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
-from omnibench.report.calibration_report import parameter_table
+from omnibench.report.calibration_report import parameter_table, path_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.c_header import left_out
@@ -245,6 +246,12 @@ def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
         print_table(console, Table("errors by kind of reference", headings, tuple(rows), note))
 
 
+def print_path_errors(console: Console, errors: Sequence[PathError], calibration: Calibration) -> None:
+    """Print the errors to expect at the ends of paths, with what holds 95 % of them; nothing where there are none."""
+    if errors:
+        print_table(console, path_table(errors, calibration))
+
+
 def _size(value: float, unit: str) -> str:
     return f"{math.degrees(value):.2f} deg" if unit == "rad" else f"{1000 * value:.1f} mm"
 
@@ -269,7 +276,7 @@ def print_verdict_ending(
 
 def how_to_use(calibration: Calibration, file: Path) -> tuple[str, ...]:
     """The next step with a calibration in words, then the words to type: an export, or a node if none holds it."""
-    if left_out(calibration):
+    if calibration.plain is None and left_out(calibration):
         return "name it in the config of a live node, which alone has its effects", "omnibench", "guide", "live"
     # The format to try first: parameters of a ROS 2 controller where one suits the robot.
     export_format = "ros2_controllers"

@@ -27,13 +27,19 @@ from omnibench.fit.estimate import (
     estimate,
     steering_unknowns,
 )
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.jackknife import FEWEST_SESSIONS, Clusters, jackknife
 from omnibench.fit.loss import loss_of
+from omnibench.fit.motion_windows import windows_of
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
 
+# Wheel samples of the runs that are looked at, 3 hours at 100 Hz: more runs say no more of a robot than slip lets them,
+# and take minutes; chosen.
+_MOST_SAMPLES = 1_000_000
+_WINDOW = 12.0  # s, of the parts of one or two long runs; chosen, as recordings of one drive are cut on import
 _MOST_STEPS = 40  # of the estimate, for its progress
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
@@ -79,20 +85,29 @@ class Map(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Gauss-Newton steps to the minimum. DataError: no run has a reference after its start."""
         self.needs_matrix(problem)
-        robot, options = problem.robot, self.options
+        robot, options, searched = problem.robot, self.options, problem.parameterisation
+        assert isinstance(searched, MatrixElements)
         tolerance = physical_tolerance(robot)
         if problem.tolerance is not None:  # of the elements, and nothing else
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
-        runs = drawn_runs(problem.trajectories)  # of very many some, which say as much as slip lets them
+        runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
+        if len(Clusters.of(runs).members) < FEWEST_SESSIONS:  # of a run or two nothing says how far they scatter
+            runs = [
+                window
+                for run in runs
+                for window in (windows_of(run, max(int(run.end / _WINDOW), 1)) if run.has_poses else [run])
+            ]
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
+
+        root = physical_prior_root(robot, tolerance, "known" if searched.known_mount else "fit")
 
         def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
             of_runs = EstimateProblem(
                 robot,
                 runs,
-                problem.parameterisation.projection @ physical_prior_root(robot, tolerance),
+                searched.projection @ root,
                 problem.integration,
                 problem.sample_period,
                 unknowns,

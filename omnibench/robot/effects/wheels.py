@@ -24,7 +24,7 @@ _CENSI = (
 
 _RADIUS_OF = "radius_"
 _WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
-_KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
+KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
 
 
 def has_rollers(robot: Robot) -> bool:
@@ -272,7 +272,7 @@ class LightWheel(EachWheelEffect):
 
 def _smooth_sign(rates: Array) -> Array:
     """Sign of wheel rates, smoothed near 0."""
-    return np.tanh(rates / _KNEE)
+    return np.tanh(rates / KNEE)
 
 
 @effects.register("wheel_dead_zone")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.robot.calibration import Calibration
+from omnibench.robot.effects.wheels import KNEE
 from omnibench.robot.kinematics import CarDrive, Drive
 
 _ARC = """\
@@ -21,7 +22,7 @@ _EULER = """\
     const double stretch = 1.0;
     const double direction = pose[2];
 """
-_HELD = ("steering_gain", "steering_offset")  # effects that the header applies
+_HELD = ("steering_gain", "steering_offset", "wheel_dead_zone")  # effects that the header applies
 _COUNTER_CLOCKWISE = "A positive rate drives the robot counter-clockwise."
 _ROLLING = "A positive rate drives the robot in the wheel's\n * direction of rolling."
 _STEERING = (
@@ -36,15 +37,18 @@ def c_header(calibration: Calibration, prefix: str) -> tuple[str, tuple[str, ...
     matrix = calibration.matrix_without_effects if _is_plain(calibration) else calibration.matrix_array
     rows = ",\n".join(f"    {{ {', '.join(literal(value) for value in row)} }}" for row in matrix)
     rates = f"const double rates[{upper}_WHEELS]"
+    lost = _held(calibration, "wheel_dead_zone", "c")
+    turning = _turning(upper, lost) if lost else ""
     if robot.drive.direct:
-        sizes = code = signals = ""
-        source, of, per, columns = "rates", "wheel", "wheel", f"{upper}_WHEELS"
+        sizes = code = ""
+        signals, source = turning, "turning" if lost else "rates"
+        of, per, columns = "wheel", "wheel", f"{upper}_WHEELS"
         arguments = f"double pose[3], {rates}, double duration"
         signs = _COUNTER_CLOCKWISE if all(wheel.lever > 0 for wheel in robot.measured) else _ROLLING
     else:
         sizes, code = definitions(upper, robot.drive), functions(prefix, robot.drive)
         gain, zero = 1 + _held(calibration, "steering_gain", "g"), _held(calibration, "steering_offset", "c")
-        signals = middle(prefix, gain, zero)
+        signals = turning + middle(prefix, gain, zero, "turning" if lost else "rates")
         source, of, per, columns = "signals", "signal", "drive signal", f"{upper}_SIGNALS"
         arguments = (
             f"double pose[3], {prefix}_odometry_state *state, {rates},\n{' ' * (len(prefix) + 34)}"
@@ -99,10 +103,10 @@ static inline void {prefix}_odometry_step({arguments})
     warnings = []
     if omitted := left_out(calibration):
         warnings.append(
-            "it holds the matrix, and a steering's gain and zero; other effects of the calibration are left out: "
+            "it holds the matrix, a steering's gain and zero, and lost rates; other effects are left out: "
             f"{omitted}; the matrix was fitted with{'out' if _is_plain(calibration) else ''} them"
         )
-    elif calibration.plain is not None:
+    elif calibration.plain is not None and calibration.driven is not None:
         warnings.append("its effects do not fade beyond what was driven; there, errors may be larger than stated")
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
@@ -140,10 +144,20 @@ static inline void {prefix}_drive_signals(double signals[{upper}_SIGNALS], const
 """
 
 
-def middle(prefix: str, gain: float, zero: float) -> str:
+def _turning(upper: str, lost: float) -> str:
+    """The part of a step that adds to each wheel's rate what it gains while it turns, rad/s, by wheel_dead_zone."""
+    return f"""\
+    double turning[{upper}_WHEELS];
+    for (int wheel = 0; wheel < {upper}_WHEELS; ++wheel) {{
+        turning[wheel] = rates[wheel] + {literal(lost)} * tanh(rates[wheel] / {literal(KNEE)});
+    }}
+"""
+
+
+def middle(prefix: str, gain: float, zero: float, rates: str = "rates") -> str:
     """The part of a step that takes the steering angles in the middle of the sample and makes the signals.
 
-    gain: true angles for measured ones, to which zero, rad, is added.
+    gain: true angles for measured ones, to which zero, rad, is added. rates: name of the array of the wheels' rates.
     """
     upper = prefix.upper()
     turned = f"        middle[wheel] = {literal(gain)} * middle[wheel] + {literal(zero)};\n"
@@ -157,7 +171,7 @@ def middle(prefix: str, gain: float, zero: float) -> str:
 {true}\
     }}
     state->known = 1;
-    {prefix}_drive_signals(signals, rates, middle);
+    {prefix}_drive_signals(signals, {rates}, middle);
 """
 
 

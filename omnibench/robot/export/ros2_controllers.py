@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from omnibench.errors import ConfigError, one_line
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, CarDrive, Mount, Robot
+from omnibench.robot.paths import legs_of, usual_paths, wheel_log
 
 _STEPS = {"arc": "arcs", "euler": "Euler steps"}
 _WRONG_WAY = "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check "
@@ -141,10 +142,7 @@ def _warnings(calibration: Calibration, fitted: Controller, design: Controller) 
     if integrated != fitted.integration:
         warnings.append(f"the matrix was calibrated for {integrated}, the controller integrates {fitted.integration}")
     if calibration.effects:
-        warnings.append(
-            "effects of the calibration are left out, the controller has none, and what that costs is not counted "
-            f"above: {calibration.effects_in_words}"
-        )
+        warnings.append(_effects_left_out(calibration))
     # Frames that are not the robot's centre, and a base frame that would leave less.
     if robot.mount is not None:
         warnings.append("the calibration is of the tracked point, the parameters are of the robot's centre (mount)")
@@ -162,6 +160,24 @@ def _warnings(calibration: Calibration, fitted: Controller, design: Controller) 
     if calibration.noise is None:
         warnings.append("covariances are left at the controller's defaults: the calibration has no noise model")
     return tuple(warnings)
+
+
+def _effects_left_out(calibration: Calibration) -> str:
+    """The effects that the controller does not hold, and by how much a live node's odometry differs for them."""
+    robot, whole = calibration.robot, calibration.model
+    matrix = replace(whole, matrix=calibration.matrix_without_effects, terms=(), fade=None)
+    parts, words = [], {"straight 1.0": "a metre ahead", "turn 360": "a turn"}
+    for path in usual_paths(robot)[:-1]:  # the square has no motion that is new
+        log = wheel_log(calibration, legs_of(path, robot))
+        x, y, heading = (whole.poses([log])[0][-1] - matrix.poses([log])[0][-1]).tolist()
+        parts.append(
+            f"{1e3 * math.hypot(x, y):.1f} mm and {math.degrees(abs(heading)):.2f} deg {words.get(path, path)}"
+        )
+    fitted = "out" if calibration.plain is not None else ""
+    return (
+        f"effects are left out, the matrix was fitted with{fitted} them: {calibration.effects_in_words}; a live node, "
+        f"which has them, differs by {', '.join(parts)}"
+    )
 
 
 def _place(x: float, y: float) -> str:

@@ -1,6 +1,7 @@
 """Effects: what each does to a robot's motion, its terms in a file, and what is refused."""
 
 import math
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -727,3 +728,11 @@ def test_delays_alternate_grow_and_swing_with_the_stamps() -> None:
     position, heading = wave.delays(stamps, {"cos": 0.0, "sin": 0.01, "frequency": 1.0})
     np.testing.assert_allclose(position, [0.01, 0.0, 0.0], atol=1e-15)
     np.testing.assert_array_equal(position, heading)
+
+
+def test_a_term_goes_to_other_processes_and_its_values_stay_as_they_are() -> None:
+    term = make_term("wheel_dead_zone", {"c": 0.01}, APR_02)
+    there = pickle.loads(pickle.dumps(term))
+    assert (there.name, dict(there.values), there.weights) == ("wheel_dead_zone", {"c": 0.01}, None)
+    with pytest.raises(TypeError):
+        term.values["c"] = 0.02  # type: ignore[index]

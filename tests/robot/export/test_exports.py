@@ -226,7 +226,9 @@ TURNED = tuple(wheel.model_copy(update={"roller_angle": -wheel.roller_angle}) fo
 ODOMETER = fixed("odometer", 0, 0.0).model_copy(update={"type": "omni", "angle": 0.0})
 EXPORTED = [
     *(calibration(robot, integration="euler") for robot, _ in ROBOTS.values()),
-    calibration(APR_02, published_matrix("palacin2023_eq8"), effects=[{"name": "slip", "parameters": {"k": 0.1}}]),
+    calibration(
+        APR_02, published_matrix("palacin2023_eq8"), effects=[{"name": "centripetal_slip", "parameters": {"k": 0.1}}]
+    ),
     calibration(mounted(DIFF), noise=None, name="of a tracked point"),
     calibration(DIFF, Mount(x=0.03, y=-0.04).twist @ held_matrix("diff"), name="of a point that nobody stated"),
     calibration(Robot(name="o", wheels=TURNED), name="rollers that form an O"),
@@ -347,6 +349,21 @@ def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
     assert "reverse the joints' axes, but not of b" in " | ".join(export.warnings)
     matrix = machine.inverse_kinematic_matrix
     np.testing.assert_allclose(ros2_controllers.closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
+
+
+@pytest.mark.parametrize(("robot", "turn"), [(DIFF, "7.20 deg a turn, "), (CAR, "mm and 7.20 deg circle")])
+def test_a_controller_without_effects_comes_with_what_a_live_node_gains(robot: Robot, turn: str) -> None:
+    matrix = robot.inverse_kinematic_matrix
+    fitted = calibration(robot, matrix, plain=matrix_rows(1.02 * matrix), effects=LOST)
+    exact = calibration(robot, matrix, plain=matrix_rows(1.02 * matrix), effects=[{**LOST[0], "parameters": {"c": 0}}])
+    (gain,) = (warning for warning in export_calibration(exact, "ros2_controllers").warnings if "live node" in warning)
+    assert "the matrix was fitted without them: wheel_dead_zone" in gain
+    assert "differs by 20.0 mm and 0.00 deg a metre ahead" in gain
+    assert turn in gain
+    held = driven_by(export_calibration(fitted, "ros2_controllers"), robot, driven_signals(robot))
+    np.testing.assert_allclose(
+        held, driven_by(export_calibration(exact, "ros2_controllers"), robot, driven_signals(robot))
+    )
 
 
 def test_an_unknown_format_is_refused_with_the_nearest_and_all() -> None:
@@ -518,17 +535,20 @@ def test_the_compiled_step_equals_the_stream(tmp_path: Path, integration: Integr
 
 
 STEERING = [{"name": "steering_gain", "parameters": {"g": 4.8}}, {"name": "steering_offset", "parameters": {"c": 0.02}}]
+LOST = [{"name": "wheel_dead_zone", "parameters": {"c": -0.3}}]
 
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("robot", "effects"), [(TRICYCLE, []), (CAR, []), (SWERVE, []), (CAR, STEERING)], ids=lambda value: str(value)[:16]
+    ("robot", "effects"),
+    [(TRICYCLE, []), (CAR, []), (SWERVE, []), (CAR, STEERING), (CAR, [*STEERING, *LOST]), (DIFF, LOST)],
+    ids=lambda value: str(value)[:16],
 )
 @pytest.mark.parametrize("integration", ["euler", "arc"])
-def test_steered_wheels_drive_as_in_the_stream(
+def test_wheels_that_steer_or_lose_rates_drive_as_in_the_stream(
     tmp_path: Path, robot: Robot, effects: list[dict[str, Any]], integration: Integration
 ) -> None:
-    """A fitted gain and zero of the steering are in the header, too."""
+    """A fitted gain and zero of the steering, and the rate that wheels lose, are in the header, too."""
     document = calibration(robot, disturbed(robot), integration=integration, effects=effects)
     rng, drive = np.random.default_rng(2), robot.drive
     rates = rng.normal(0, 4, (300, len(drive.wheels)))
@@ -537,9 +557,10 @@ def test_steered_wheels_drive_as_in_the_stream(
     export = export_calibration(document, "c_header")
     poses = run_header(export, tmp_path, robot.name, np.column_stack([rates, steering, durations]), len(drive.wheels))
     stream = document.model.stream(START)
-    expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, steering, durations, strict=True)]
+    ends = steering if drive.steered else [None] * len(rates)
+    expected = [stream.drive(a * d, d, steering=s) for a, s, d in zip(rates, ends, durations, strict=True)]
     np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-12)
-    assert all(f"/* {name} */" in export.text for name in drive.names)
+    assert drive.direct or all(f"/* {name} */" in export.text for name in drive.names)
     assert "left out" not in " ".join((export.text, *export.warnings))
 
 
