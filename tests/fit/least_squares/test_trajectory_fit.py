@@ -1,4 +1,4 @@
-"""Runs made ready, the steps of a fit (derivatives, nuisances, the box, weights), and the noise of references."""
+"""Runs made ready, the steps of a fit (nuisances, the box), and the noise of references."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,17 +7,15 @@ from typing import Literal
 import numpy as np
 import pytest
 from discovery_samples import simulated
-from fit_samples import make_problem, noisy_trajectories
+from fit_samples import make_problem
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from omnibench.fit.calibrators.trajectory_ml import robust_noise
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting import fit_matrix, with_noise
 from omnibench.errors import DataError
-from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
-from omnibench.fit.loss import LossName, cost_weightings
+from omnibench.fit.gauss_newton import bounded_step
 from omnibench.fit.noise import (
     Difference,
     Differences,
@@ -44,34 +42,29 @@ from omnibench.fit.trajectory_fit import (
     whitened,
 )
 from omnibench.fit.trajectory_fit import given as after_fitting
-from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
 NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.005, walk_heading=0.005, bias_position=0.01)
 PROBLEM = make_problem()
-START = first_fit(PROBLEM)
-WEIGHTINGS = whiteners(NOISE, START.trajectories.stamps)
-RUNS = len(START.trajectories.runs)
+RUNS = len(PROBLEM.trajectories)
 
 
-def with_deviations(deviations: Array, values: Array | None = None) -> BoxedFit:
-    """The start with nuisances that have these standard deviations."""
-    return START.with_nuisances(Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations))
+def with_deviations(deviations: Array, values: Array | None = None) -> TrajectoryFit:
+    """The design at the runs, with nuisances that have these standard deviations."""
+    model = OdometryModel.of_design(PROBLEM.robot, "arc")
+    nuisances = Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations)
+    return TrajectoryFit(model, PROBLEM.trajectories, nuisances)
 
 
-def chi2(fit: BoxedFit) -> Array:
-    return fit.trajectories.chi_square(WEIGHTINGS)
+WEIGHTINGS = whiteners(NOISE, with_deviations(np.zeros(3)).stamps)
 
 
-def test_the_scores_are_the_slopes_of_the_objective() -> None:
-    data = START.linearised(WEIGHTINGS)
-    assert np.square(data.residuals).sum() == pytest.approx(chi2(START).sum())
-    for index, step in enumerate(1e-6 * np.eye(PROBLEM.size)):
-        after, before = (chi2(START.moved(PROBLEM.start + sign * step, np.zeros((RUNS, 3)))).sum() for sign in (1, -1))
-        assert data.scores.sum(axis=0)[index] == pytest.approx(-(after - before) / 4e-6, rel=1e-4)
+def chi2(fit: TrajectoryFit) -> Array:
+    return fit.chi_square(WEIGHTINGS)
 
 
 @pytest.mark.parametrize(
@@ -84,20 +77,13 @@ def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, d
     deviations = np.where(np.arange(3) == nuisance, deviation, 0.0)
     values = np.zeros((RUNS, 3))
     for _ in range(4):
-        values = with_deviations(deviations, values).trajectories.likeliest_nuisances(WEIGHTINGS)
+        values = with_deviations(deviations, values).likeliest_nuisances(WEIGHTINGS)
     assert not np.delete(values, nuisance, axis=1).any()
     there = chi2(with_deviations(deviations, values))
     assert there.sum() < 0.9 * chi2(with_deviations(deviations)).sum()
     for away in (-0.05, 0.05):
         moved = values + away * (np.abs(values) + deviations)
         assert (chi2(with_deviations(deviations, moved)) > (1 - kinks) * there).all()
-
-
-def test_what_nuisances_take_up_is_no_information() -> None:
-    held = START.linearised(WEIGHTINGS).information
-    free = with_deviations(np.array([0.05, 0.2, 0.01])).linearised(WEIGHTINGS).information
-    assert np.linalg.eigvalsh(held - free).min() >= -1e-9 * np.linalg.eigvalsh(held).max()
-    assert np.trace(free) < 0.99 * np.trace(held)
 
 
 @given(seed=st.integers(0, 2**31), reach=st.floats(0.01, 10.0))
@@ -115,25 +101,6 @@ def test_a_step_within_the_box_is_the_best_there_is(seed: int, reach: float) -> 
     small = 1e-5 * np.abs(score * unit).max()
     assert (slope[vector + step > PROBLEM.lower + 10 * room] < small).all()
     assert (slope[vector + step < PROBLEM.upper - 10 * room] > -small).all()
-
-
-@pytest.mark.parametrize("name", ["final_pose", "final_position", "final_heading"])
-def test_final_errors_are_weighted_as_the_cost_weighs_them(name: str) -> None:
-    cost = costs.create(name)
-    residuals = START.trajectories.residuals
-    weightings = cost_weightings(cost, START.trajectories.runs, residuals)
-    lengths = np.array([np.linalg.norm(weigh(own)) for weigh, own in zip(weightings, residuals, strict=True)])
-    of_each = cost.of_each(np.array([own[-1] for own in residuals]), np.arange(len(residuals)))
-    assert lengths / lengths.mean() == pytest.approx(of_each / of_each.mean())
-    assert np.square(lengths).mean() == pytest.approx(1.0)
-
-
-def test_errors_along_the_way_count_the_same_for_every_run_whatever_its_number_of_stamps() -> None:
-    residuals = START.trajectories.residuals
-    weightings = cost_weightings(costs.create("trajectory"), START.trajectories.runs, residuals)
-    squares = [np.square(weigh(own)).sum() for weigh, own in zip(weightings, residuals, strict=True)]
-    mean_squares = np.array([np.square(own).sum(axis=1).mean() for own in residuals])
-    assert squares == pytest.approx(mean_squares / mean_squares.mean())
 
 
 def fit_of(runs, dataset):
@@ -472,38 +439,6 @@ def test_the_likeliest_shift_is_that_of_generalised_least_squares(seed: int) -> 
     inverse = np.linalg.inv(covariance("heading"))
     assert variances[2] == pytest.approx(1 / inverse.sum(), rel=1e-9)
     assert shift[2] == pytest.approx(inverse.sum(axis=0) @ residuals[:, 2] / inverse.sum(), rel=1e-9)
-
-
-def fit_of_a_jump(run: int, pose: int, by: float) -> TrajectoryFit:
-    """A fit of runs, of which one pose has jumped."""
-    runs = list(noisy_trajectories(noise=0.002, encoder=0.002))
-    poses = runs[run].poses.copy()
-    poses[pose, 0] += by
-    runs[run] = replace(runs[run], poses=poses)
-    return first_fit(make_problem(runs)).trajectories
-
-
-FOUND_NOISE = Noise(pose_position=0.02, pose_heading=0.02, walk_position=0.05, walk_heading=0.05)
-
-
-@pytest.mark.parametrize("loss", ["huber", "student_t"])
-def test_a_pose_that_has_jumped_loses_its_weight_and_its_neighbours_keep_theirs(loss: LossName) -> None:
-    fit = fit_of_a_jump(2, 4, 1.0)
-    found = robust_noise(FOUND_NOISE, fit, loss)
-    weights = found.runs[2].poses
-    assert weights[3] < 0.1
-    assert np.delete(weights, 3).min() > 0.5
-    assert len(found.without_jumps(fit).runs[2].poses) == len(fit.runs[2].poses) - 1
-
-
-@pytest.mark.parametrize("loss", ["huber", "student_t"])
-def test_a_run_whose_start_has_jumped_keeps_the_weights_of_its_poses(loss: LossName) -> None:
-    fit = fit_of_a_jump(2, 0, 1.0)
-    found = robust_noise(FOUND_NOISE, fit, loss)
-    assert [run.near for run in found.runs] == [index != 2 for index in range(len(fit.runs))]
-    assert found.runs[2].poses.min() > 0.5
-    assert found.runs[2].extra.position[1] > 0.1  # m^2: a metre is likely
-    assert len(found.without_jumps(fit).runs) == len(fit.runs) - 1
 
 
 Split = Literal["train", "validation"]
