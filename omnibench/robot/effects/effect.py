@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 
@@ -402,14 +402,6 @@ class Term:
     def name(self) -> str:
         """The effect's name."""
         return self.effect.name
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """How a job takes it to another process: views of mappings cannot be pickled."""
-        return _term_of, (self.effect, dict(self.values), self.weights)
-
-
-def _term_of(effect: Effect, values: dict[str, float], weights: str | None) -> Term:
-    return Term(effect, MappingProxyType(values), weights)
 
 
 def make_term(
