@@ -7,23 +7,18 @@ from typing import Literal
 import numpy as np
 import pytest
 from discovery_samples import simulated
-from fit_samples import make_problem, noisy_trajectories
+from fit_samples import make_problem
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
-from omnibench.fit.calibrators.trajectory_ml import robust_noise
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting import fit_matrix, with_noise
 from omnibench.errors import DataError
-from omnibench.fit.gauss_newton import BoxedFit, bounded_step, first_fit
-from omnibench.fit.loss import LossName, cost_weightings
+from omnibench.fit.gauss_newton import bounded_step
 from omnibench.fit.noise import (
     Difference,
     Differences,
-    ExtraVariance,
     Whitener,
-    covariance_of_sums,
     differences_between_repetitions,
     estimate_noise,
     repeating_runs,
@@ -44,33 +39,43 @@ from omnibench.fit.trajectory_fit import (
     whitened,
 )
 from omnibench.fit.trajectory_fit import given as after_fitting
-from omnibench.registry import costs
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
+from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
 NOISE = Noise(pose_position=0.01, pose_heading=0.01, walk_position=0.005, walk_heading=0.005, bias_position=0.01)
 PROBLEM = make_problem()
-START = first_fit(PROBLEM)
-WEIGHTINGS = whiteners(NOISE, START.trajectories.stamps)
-RUNS = len(START.trajectories.runs)
+RUNS = len(PROBLEM.trajectories)
 
 
-def with_deviations(deviations: Array, values: Array | None = None) -> BoxedFit:
-    """The start with nuisances that have these standard deviations."""
-    return START.with_nuisances(Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations))
+def with_deviations(deviations: Array, values: Array | None = None, vector: Array = PROBLEM.start) -> TrajectoryFit:
+    """The fit of a vector, by default the start, with nuisances that have these standard deviations."""
+    model = OdometryModel(PROBLEM.robot, PROBLEM.matrix(vector), PROBLEM.integration)
+    nuisances = Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations)
+    return TrajectoryFit(model, PROBLEM.trajectories, nuisances)
 
 
-def chi2(fit: BoxedFit) -> Array:
-    return fit.trajectories.chi_square(WEIGHTINGS)
+START = with_deviations(np.zeros(3))
+WEIGHTINGS = whiteners(NOISE, START.stamps)
+
+
+def chi2(fit: TrajectoryFit) -> Array:
+    return fit.chi_square(WEIGHTINGS)
+
+
+def linearised(fit: TrajectoryFit) -> Whitened:
+    return fit.linearised(fit.matrix_jacobian(), WEIGHTINGS)
 
 
 def test_the_scores_are_the_slopes_of_the_objective() -> None:
-    data = START.linearised(WEIGHTINGS)
+    data = linearised(START)
     assert np.square(data.residuals).sum() == pytest.approx(chi2(START).sum())
     for index, step in enumerate(1e-6 * np.eye(PROBLEM.size)):
-        after, before = (chi2(START.moved(PROBLEM.start + sign * step, np.zeros((RUNS, 3)))).sum() for sign in (1, -1))
+        after, before = (
+            chi2(with_deviations(np.zeros(3), None, PROBLEM.start + sign * step)).sum() for sign in (1, -1)
+        )
         assert data.scores.sum(axis=0)[index] == pytest.approx(-(after - before) / 4e-6, rel=1e-4)
 
 
@@ -84,7 +89,7 @@ def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, d
     deviations = np.where(np.arange(3) == nuisance, deviation, 0.0)
     values = np.zeros((RUNS, 3))
     for _ in range(4):
-        values = with_deviations(deviations, values).trajectories.likeliest_nuisances(WEIGHTINGS)
+        values = with_deviations(deviations, values).likeliest_nuisances(WEIGHTINGS)
     assert not np.delete(values, nuisance, axis=1).any()
     there = chi2(with_deviations(deviations, values))
     assert there.sum() < 0.9 * chi2(with_deviations(deviations)).sum()
@@ -94,8 +99,8 @@ def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, d
 
 
 def test_what_nuisances_take_up_is_no_information() -> None:
-    held = START.linearised(WEIGHTINGS).information
-    free = with_deviations(np.array([0.05, 0.2, 0.01])).linearised(WEIGHTINGS).information
+    held = linearised(START).information
+    free = linearised(with_deviations(np.array([0.05, 0.2, 0.01]))).information
     assert np.linalg.eigvalsh(held - free).min() >= -1e-9 * np.linalg.eigvalsh(held).max()
     assert np.trace(free) < 0.99 * np.trace(held)
 
@@ -115,25 +120,6 @@ def test_a_step_within_the_box_is_the_best_there_is(seed: int, reach: float) -> 
     small = 1e-5 * np.abs(score * unit).max()
     assert (slope[vector + step > PROBLEM.lower + 10 * room] < small).all()
     assert (slope[vector + step < PROBLEM.upper - 10 * room] > -small).all()
-
-
-@pytest.mark.parametrize("name", ["final_pose", "final_position", "final_heading"])
-def test_final_errors_are_weighted_as_the_cost_weighs_them(name: str) -> None:
-    cost = costs.create(name)
-    residuals = START.trajectories.residuals
-    weightings = cost_weightings(cost, START.trajectories.runs, residuals)
-    lengths = np.array([np.linalg.norm(weigh(own)) for weigh, own in zip(weightings, residuals, strict=True)])
-    of_each = cost.of_each(np.array([own[-1] for own in residuals]), np.arange(len(residuals)))
-    assert lengths / lengths.mean() == pytest.approx(of_each / of_each.mean())
-    assert np.square(lengths).mean() == pytest.approx(1.0)
-
-
-def test_errors_along_the_way_count_the_same_for_every_run_whatever_its_number_of_stamps() -> None:
-    residuals = START.trajectories.residuals
-    weightings = cost_weightings(costs.create("trajectory"), START.trajectories.runs, residuals)
-    squares = [np.square(weigh(own)).sum() for weigh, own in zip(weightings, residuals, strict=True)]
-    mean_squares = np.array([np.square(own).sum(axis=1).mean() for own in residuals])
-    assert squares == pytest.approx(mean_squares / mean_squares.mean())
 
 
 def fit_of(runs, dataset):
@@ -226,15 +212,6 @@ def test_whitened_residuals_are_those_of_the_dense_covariance(noise: Noise, stam
     assert np.square(whitener(residuals)).sum() == pytest.approx(squares, rel=1e-6)
     determinant = 2 * np.linalg.slogdet(position)[1] + np.linalg.slogdet(heading)[1]
     assert whitener.log_determinant == pytest.approx(determinant, rel=1e-6, abs=1e-6)
-
-
-@given(noise=NOISES, stamps=STAMPS, seed=st.integers(0, 2**31))
-def test_sums_of_errors_have_the_covariance_that_the_dense_one_gives(noise: Noise, stamps: Array, seed: int) -> None:
-    weights = np.random.default_rng(seed).standard_normal((len(stamps), 2, 4))
-    left = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
-    heading = dense(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
-    expected = weights[:, 0].T @ left @ weights[:, 0] + weights[:, 1].T @ heading @ weights[:, 1]
-    assert_allclose(covariance_of_sums(noise, stamps, weights, [1, 2]), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_derivatives_are_whitened_column_by_column_and_a_bias_alone_can_be_whitened() -> None:
@@ -438,20 +415,8 @@ HEAVY_NOISE = Noise(
 HEAVY_STAMPS = np.array([0.3, 0.5, 1.1, 1.2, 2.0])
 
 
-def covariance(kind: str, of_poses: Array | float = 0.0, of_all: float = 0.0) -> Array:
-    components = (getattr(HEAVY_NOISE, f"{part}_{kind}") for part in ("pose", "walk", "bias"))
-    return dense(*components, HEAVY_STAMPS) + of_all + of_poses * np.eye(5)
-
-
-@given(seed=st.integers(0, 10**6))
-def test_variance_beyond_the_noise_whitens_as_the_dense_covariance_does(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    extra = ExtraVariance((rng.exponential(1e-3, 5), 1e-4), (rng.exponential(1e-3, 5), 0.0))
-    residuals = rng.standard_normal((5, 3))
-    white = Whitener(HEAVY_NOISE, HEAVY_STAMPS, extra)(residuals)
-    position, heading = covariance("position", *extra.position), covariance("heading", *extra.heading)
-    expected = [r @ np.linalg.solve(c, r) for r, c in zip(residuals.T, (position, position, heading), strict=True)]
-    assert np.square(white).sum() == pytest.approx(sum(expected), rel=1e-9)
+def covariance(kind: str) -> Array:
+    return dense(*(getattr(HEAVY_NOISE, f"{part}_{kind}") for part in ("pose", "walk", "bias")), HEAVY_STAMPS)
 
 
 @given(seed=st.integers(0, 10**6))
@@ -463,47 +428,6 @@ def test_what_the_others_say_of_a_pose_is_that_of_the_dense_inverse(seed: int) -
     gain = np.linalg.solve(dense[np.ix_(others, others)], dense[others, 2])
     assert errors[2, 0] == pytest.approx(residuals[2, 0] - gain @ residuals[others, 0], rel=1e-9)
     assert variances[2, 1] == pytest.approx(dense[2, 2] - gain @ dense[others, 2], rel=1e-9)
-
-
-@given(seed=st.integers(0, 10**6))
-def test_the_likeliest_shift_is_that_of_generalised_least_squares(seed: int) -> None:
-    residuals = np.random.default_rng(seed).standard_normal((5, 3))
-    shift, variances = Whitener(HEAVY_NOISE, HEAVY_STAMPS).shift(residuals)
-    inverse = np.linalg.inv(covariance("heading"))
-    assert variances[2] == pytest.approx(1 / inverse.sum(), rel=1e-9)
-    assert shift[2] == pytest.approx(inverse.sum(axis=0) @ residuals[:, 2] / inverse.sum(), rel=1e-9)
-
-
-def fit_of_a_jump(run: int, pose: int, by: float) -> TrajectoryFit:
-    """A fit of runs, of which one pose has jumped."""
-    runs = list(noisy_trajectories(noise=0.002, encoder=0.002))
-    poses = runs[run].poses.copy()
-    poses[pose, 0] += by
-    runs[run] = replace(runs[run], poses=poses)
-    return first_fit(make_problem(runs)).trajectories
-
-
-FOUND_NOISE = Noise(pose_position=0.02, pose_heading=0.02, walk_position=0.05, walk_heading=0.05)
-
-
-@pytest.mark.parametrize("loss", ["huber", "student_t"])
-def test_a_pose_that_has_jumped_loses_its_weight_and_its_neighbours_keep_theirs(loss: LossName) -> None:
-    fit = fit_of_a_jump(2, 4, 1.0)
-    found = robust_noise(FOUND_NOISE, fit, loss)
-    weights = found.runs[2].poses
-    assert weights[3] < 0.1
-    assert np.delete(weights, 3).min() > 0.5
-    assert len(found.without_jumps(fit).runs[2].poses) == len(fit.runs[2].poses) - 1
-
-
-@pytest.mark.parametrize("loss", ["huber", "student_t"])
-def test_a_run_whose_start_has_jumped_keeps_the_weights_of_its_poses(loss: LossName) -> None:
-    fit = fit_of_a_jump(2, 0, 1.0)
-    found = robust_noise(FOUND_NOISE, fit, loss)
-    assert [run.near for run in found.runs] == [index != 2 for index in range(len(fit.runs))]
-    assert found.runs[2].poses.min() > 0.5
-    assert found.runs[2].extra.position[1] > 0.1  # m^2: a metre is likely
-    assert len(found.without_jumps(fit).runs) == len(fit.runs) - 1
 
 
 Split = Literal["train", "validation"]
