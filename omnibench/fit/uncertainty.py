@@ -113,7 +113,6 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
     untold = depending(slopes, _not_moved(problem, result)) | elements_open(problem.parameterisation)
-    untold |= ~slopes.any(axis=1)  # such as the row sideways of a robot that cannot slide
     reach = np.where(untold, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,

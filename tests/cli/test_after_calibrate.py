@@ -32,7 +32,7 @@ def calibration() -> Path:
         ("certify CALIBRATION DATA --seconds 2", "optimum of the matrix alone"),
         ("export CALIBRATION --to ros2_controllers", "wheel"),
         ("export CALIBRATION --to robot_localization", "covariance"),
-        ("export CALIBRATION --to c_header", "wheel_dead_zone"),
+        ("export CALIBRATION --to c_header", "turning"),
         ("design DATA", "runs"),
         *slow_cases(
             ("discover DATA --model CALIBRATION -o found", "held out"),
