@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -46,7 +46,6 @@ from scipy.special import chdtr
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import ConfigError
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.noise import LEAST_WHITE
 from omnibench.robot.kinematics import Array, Robot, compose, relative
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
@@ -97,11 +96,6 @@ class Loss(ABC):
         """True (S,) for the norms (S,) that are not far off the others, by their weights."""
         ratios = norms / self.scales(norms[None], shares)[0]
         return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
-
-    def mean_curvature(self, ratios: Array, shares: Array) -> float:
-        """Mean second derivative of the loss over the d directions of errors at ratios (S,), over the mean weight."""
-        weights = self.weights(ratios)
-        return max(1 + float(self.slopes(ratios) @ shares) / (self.coordinates * float(weights @ shares)), OFF)
 
     @abstractmethod
     def slopes(self, ratios: Array) -> Array:
@@ -346,50 +340,3 @@ def norms_of(cost: Cost) -> SumOfNorms | None:
     """The sum of norms that a cost is, or whose norms a robust loss weighs; None for other costs."""
     base = cost.base if isinstance(cost, RobustCost) else cost
     return base if isinstance(base, SumOfNorms) else None
-
-
-@dataclass(frozen=True, eq=False)
-class CostWeighting:
-    """Scales a run's pose residuals by ``scale`` (3,) or (k, 3); last_alone: all but the last pose are left out."""
-
-    scale: Array
-    last_alone: bool
-
-    def __call__(self, residuals: Array) -> Array:
-        """Weighted residuals (k, 3) or derivatives (k, 3, n)."""
-        chosen = residuals[-1:] if self.last_alone else residuals
-        return np.asarray(chosen * self.scale.reshape(*self.scale.shape, *([1] * (residuals.ndim - 2))))
-
-
-def cost_weightings(cost: Cost, trajectories: Sequence[Trajectory], residuals: Sequence[Array]) -> list[CostWeighting]:
-    """The weighting of every run, at the cost's stamps: equal for all runs, normalised to unit mean square over them.
-
-    A cost that is no sum of norms has no weights; m and rad then count alike. A robust one has weights of its poses,
-    which are those of the residuals.
-    """
-    base = norms_of(cost)
-    weights = np.array((1.0, 1.0, 1.0) if base is None else base.weights)
-    last_alone = cost.stamps == "final"
-    raw = [
-        CostWeighting(weights / np.sqrt(1 if last_alone else len(run.pose_times) - 1), last_alone)
-        for run in trajectories
-    ]
-    if isinstance(cost, RobustCost):
-        errors, owner = _at_stamps(cost, residuals)
-        roots = np.sqrt(cost.weights(errors, owner))[:, None]
-        raw = [CostWeighting(roots[owner == run] * weigh.scale, last_alone) for run, weigh in enumerate(raw)]
-    squares = [float(np.square(weigh(errors)).sum()) for weigh, errors in zip(raw, residuals, strict=True)]
-    size = max(float(np.sqrt(np.mean(squares))), LEAST_WHITE)
-    return [CostWeighting(weigh.scale / size, last_alone) for weigh in raw]
-
-
-def mean_curvature(cost: RobustCost, residuals: Sequence[Array]) -> float:
-    """Mean second derivative of a robust cost's loss over the mean of its weights, at every run's residuals (K, 3)."""
-    errors, owner = _at_stamps(cost, residuals)
-    return cost.loss.mean_curvature(cost.ratios(errors, owner), cost.base.shares(owner))
-
-
-def _at_stamps(cost: Cost, residuals: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
-    """The residuals (S, 3) at a cost's stamps, of those (K, 3) of every run, and the run (S,) of each."""
-    chosen = [of_run[-1:] if cost.stamps == "final" else of_run for of_run in residuals]
-    return np.concatenate(chosen), np.repeat(np.arange(len(chosen)), [len(of_run) for of_run in chosen])

@@ -224,32 +224,22 @@ def _common(stamps: Sequence[Array]) -> tuple[Array, list[NDArray[np.intp]]]:
     return grid[fresh], [index[fresh] for index in chosen]
 
 
-@dataclass(frozen=True, eq=False)
-class ExtraVariance:
-    """Variances beyond the noise, m^2 and rad^2: of each pose of a run (K,), and of all its poses together."""
-
-    position: tuple[Array, float]
-    heading: tuple[Array, float]
-
-
 class Whitener:
     """Turns the pose residuals of one run into independent ones of unit variance, exactly, in O(K).
 
     stamps (K,): s, > 0, increasing; the start pose at t = 0 is not among them. log_determinant: of the covariance of
     all 3K residuals. Without white noise and walk the covariance is singular: white noise of 1e-9 (m, rad) stands in.
-    extra: variance beyond the noise.
     """
 
     log_determinant: float
 
-    def __init__(self, noise: Noise, stamps: Array, extra: ExtraVariance | None = None) -> None:
+    def __init__(self, noise: Noise, stamps: Array) -> None:
         stamps = np.asarray(stamps, dtype=float)
         steps = np.diff(stamps, prepend=0.0)
         if stamps.ndim != 1 or len(stamps) == 0 or not (steps > 0).all():
             raise ValueError("stamps must be increasing and > 0")
-        position, heading = (None, None) if extra is None else (extra.position, extra.heading)
-        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps, position)
-        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps, heading)
+        self._position = _Factor(noise.pose_position, noise.walk_position, noise.bias_position, steps)
+        self._heading = _Factor(noise.pose_heading, noise.walk_heading, noise.bias_heading, steps)
         self.log_determinant = 2 * self._position.log_determinant + self._heading.log_determinant
 
     def __call__(self, residuals: Array) -> Array:
@@ -293,34 +283,12 @@ class Whitener:
             variances[:, columns] = of_each[:, None]
         return errors, variances
 
-    def shift(self, residuals: Array) -> tuple[Array, Array]:
-        """The likeliest shift (3,) of a run whose errors have no bias, and its variances (3,)."""
-        parts = [self._position.shift(residuals[:, :2]), self._heading.shift(residuals[:, 2:])]
-        return np.concatenate([value for value, _ in parts]), np.array([parts[0][1], parts[0][1], parts[1][1]])
-
 
 def whiteners(noise: Noise, stamps: Sequence[Array]) -> list[Whitener]:
     """The whitening of runs with stamps (K,); those with the same stamps share theirs."""
     made = {times.tobytes(): times for times in stamps}
     whitener_of = {key: Whitener(noise, times) for key, times in made.items()}
     return [whitener_of[times.tobytes()] for times in stamps]
-
-
-def covariance_of_sums(noise: Noise, stamps: Array, weights: Array, coordinates: Sequence[int]) -> Array:
-    """Covariance (n, n) of n weighted sums of a run's errors, in O(K).
-
-    weights (K, c, n): of the errors of c coordinates (0 and 1 position, 2 heading) at stamps (K,), s, increasing. A
-    step of the walk is in the errors of its stamp and of all later ones.
-    """
-    total = np.zeros((weights.shape[2],) * 2)
-    steps = np.sqrt(np.diff(stamps, prepend=0.0))[:, None]
-    for coordinate, columns in zip(coordinates, weights.swapaxes(0, 1), strict=True):
-        kind = "heading" if coordinate == 2 else "position"
-        white, walk, bias = (getattr(noise, f"{part}_{kind}") for part in ("pose", "walk", "bias"))
-        later = columns[::-1].cumsum(axis=0)[::-1]
-        independent = np.vstack([max(white, LEAST_WHITE) * columns, walk * steps * later, bias * later[:1]])
-        total += independent.T @ independent
-    return total
 
 
 def is_near(first: Mapping[str, float], second: Mapping[str, float], share: float) -> bool:
@@ -332,13 +300,10 @@ def is_near(first: Mapping[str, float], second: Mapping[str, float], share: floa
 class _Factor:
     """The Cholesky factor of one coordinate's covariance, as a lower bidiagonal matrix of the differences.
 
-    steps (K,): s from each stamp to the next, the first from t = 0. extra: variances (K,) of single poses and of all
-    together, beyond the noise.
+    steps (K,): s from each stamp to the next, the first from t = 0.
     """
 
-    def __init__(
-        self, white: float, walk: float, bias: float, steps: Array, extra: tuple[Array, float] | None = None
-    ) -> None:
+    def __init__(self, white: float, walk: float, bias: float, steps: Array) -> None:
         walked = walk**2 * (steps[1:] if bias else steps)
         self._steps, self._singular = steps, white**2 + walked.min(initial=np.inf) < LEAST_WHITE**2
         if self._singular:
@@ -347,12 +312,6 @@ class _Factor:
         bands[0] = 2 * white**2 + walk**2 * steps
         bands[0, 0] += bias**2 - white**2
         bands[1] = -(white**2)
-        if extra is not None:
-            of_poses, of_all = extra
-            bands[0] += of_poses
-            bands[0, 1:] += of_poses[:-1]
-            bands[0, 0] += of_all
-            bands[1] -= of_poses
         self._factor, failed = dpbtrf(bands, lower=1, overwrite_ab=1)
         if failed:
             raise DataError("the noise or the stamps of a run are not finite; omnibench check DATASET says more")
@@ -400,11 +359,6 @@ class _Factor:
         inner, beside = self._inverse_bands()
         inner[:-1] += inner[1:] - 2 * beside
         return solved / inner[:, None], 1 / inner
-
-    def shift(self, residuals: Array) -> tuple[Array, float]:
-        """The likeliest shift (n,) of residuals (K, n), and its variance."""
-        information = float(self._inverse_bands()[0][0])
-        return self._solved(residuals)[0] / information, 1 / information
 
     def _solved(self, residuals: Array) -> Array:
         """The covariance of the differences, inverted, times the differences of residuals (K, n)."""

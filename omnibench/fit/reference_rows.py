@@ -257,28 +257,6 @@ class ReferenceRows:
         untold[start.placed] = (squares < _TELLING)[start.of_placed]
         return untold
 
-    def start_columns(self, run: int, predicted: Array) -> Array:
-        """Derivatives (K, 3, 3) of the rows of a run by its start x, y and heading, (K, 3, 0) where that is known.
-
-        predicted (S, 3): of all rows.
-        """
-        rows = self.trajectory == run
-        fixed = self.begins_at_start[rows]
-        if self.runs[run].start_known or not fixed.any():
-            return np.zeros((*fixed.shape, 0))
-        x, y = (predicted[rows] - predicted[rows].mean(axis=0))[:, :2].T
-        nothing, one = np.zeros(len(fixed)), np.ones(len(fixed))
-        columns = np.array([[one, nothing, -y], [nothing, one, x], [nothing, nothing, one]])  # (3, 3, K)
-        return np.moveaxis(columns, 2, 0) * fixed[..., None]
-
-    @property
-    def numbers_of_starts(self) -> int:
-        """Numbers that unknown start poses take: three of a run with positions and one of a run with headings alone."""
-        if (start := self._unknown_starts) is None:
-            return 0
-        places, headings = (np.bincount(of, minlength=start.count) for of in (start.of_placed, start.of_headed))
-        return int(np.where(places > 0, np.minimum(3, 2 * places + headings), 1).sum())
-
     def predicted(self, poses: Array, lengths: Array) -> Array:
         """Predictions (P, S, 3) of a model from its poses (P, T, 3) and distances driven (P, T) at the logs' stamps."""
         begin, end = self._stamp_of_rows
@@ -332,15 +310,6 @@ class ReferenceRows:
             columns = start.slopes(places, headings, result[start.placed, :2], result[start.headed, 2])
             result[start.placed, :2], result[start.headed, 2] = columns
         return result
-
-    def start_turns(self, poses: Array) -> Array:
-        """Likeliest headings (Z,) of the runs' unknown starts, for poses (T, 3) at the logs' stamps; 0 of others."""
-        turns = np.zeros(len(self.runs))
-        if (start := self._unknown_starts) is not None:
-            _, end = self._stamp_of_rows
-            runs = np.unique(self.trajectory[np.concatenate([start.placed, start.headed])])
-            turns[runs] = start.turns(poses[None, end[start.placed], :2], poses[None, end[start.headed], 2])[0]
-        return turns
 
     @cached_property
     def _unknown_starts(self) -> StartPoses | None:
@@ -459,10 +428,6 @@ class ReferenceBatch:
         if self._ways:
             lengths = np.concatenate([way.lengths(matrices) for way in self._ways], axis=1)
         return self.rows.predicted(poses, lengths)
-
-    def start_turns(self, matrix: Array) -> Array:
-        """Likeliest headings (Z,) of the runs' unknown starts by a matrix (3, M), 0 of those that are known, rad."""
-        return self.rows.start_turns(self._odometry.poses(matrix[None])[0])
 
     def jacobian(self, matrix: Array) -> Array:
         """Derivatives (S, 3, 3, M) of the predictions with respect to the elements of one matrix (3, M)."""

@@ -34,7 +34,7 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.sum_of_norms import SolverError, SumOfNormsProgram
 from omnibench.progress import Progress
 from omnibench.registry import Options, calibrators, costs
-from omnibench.robot.calibration import EffectTerm, matrix_rows
+from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
@@ -573,13 +573,24 @@ def test_a_proof_without_a_gap_goes_on_to_its_limit_and_foretells_nothing() -> N
 def test_where_nothing_is_left_but_rounding_there_is_nothing_to_gain() -> None:
     runs = synthetic_trajectories(synthetic_robot(), "arc")[:2]
     dataset = make_dataset("exact", synthetic_robot(), 0.2, runs, simulated=True)
-    run = calibrate(dataset)
+    run = calibrate(dataset, "closed_form")
     assert run.result.cost < 1e-9
     certified = certify_optimum(run.calibration, dataset, parts=5)
     assert certified.certificate.gap == 0.0
     told = on_terminal(print_certificate, certified, width=120)
     assert "There is nothing to gain: what is left is rounding" in told
     assert "to gain on this calibration" not in told
+
+
+def test_of_a_calibration_with_effects_the_optimum_of_the_matrix_alone_is_certified() -> None:
+    dataset = make_dataset("noisy", synthetic_robot(), PERIOD, list(noisy_trajectories()), simulated=True)
+    of_map, optimum = (calibrate(dataset, name).calibration for name in ("map", "closed_form"))
+    assert of_map.effects
+    certified, alone = (certify_optimum(each, dataset, parts=20).certificate for each in (of_map, optimum))
+    assert certified.cost == pytest.approx(alone.cost, rel=1e-6)
+    assert certified.lower_bound <= certified.cost
+    assert certified.shrinking is not None
+    assert alone.shrinking is None
 
 
 def test_a_calibration_outside_the_box_is_said_to_be_outside() -> None:
@@ -599,9 +610,6 @@ def test_what_no_bound_is_proven_of_is_refused() -> None:
         LowerBounds(make_problem(parameterisation="geometry"))
     with pytest.raises(DataError, match="wheels fl, fr, rl, rr"):
         certify_optimum(design_of(synthetic_dataset(4), "arc"), dataset)
-    drift = EffectTerm(name="heading_drift", parameters={"b": 0.001})
-    with pytest.raises(DataError, match=r"'design' has effects \(heading_drift\)"):
-        certify_optimum(design_of(dataset, "arc").model_copy(update={"effects": (drift,)}), dataset)
     runs = [replace(run, split="validation") for run in noisy_trajectories()]
     with pytest.raises(DataError, match="training split is empty"):
         certify_optimum(design_of(dataset, "arc"), make_dataset("none", synthetic_robot(), PERIOD, runs))

@@ -398,10 +398,6 @@ class Term:
     values: Values
     weights: str | None = None
 
-    def __reduce__(self) -> tuple[type[Term], tuple[Effect, dict[str, float], str | None]]:
-        """For other processes: values that cannot be changed cannot be pickled either."""
-        return Term, (self.effect, dict(self.values), self.weights)
-
     @property
     def name(self) -> str:
         """The effect's name."""

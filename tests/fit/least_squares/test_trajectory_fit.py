@@ -1,4 +1,4 @@
-"""Runs made ready, the steps of a fit (nuisances, the box), and the noise of references."""
+"""Runs made ready, the steps of a fit (derivatives, nuisances, the box, weights), and the noise of references."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,6 @@ from discovery_samples import simulated
 from fit_samples import make_problem
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.fitting import fit_matrix, with_noise
@@ -19,9 +18,7 @@ from omnibench.fit.gauss_newton import bounded_step
 from omnibench.fit.noise import (
     Difference,
     Differences,
-    ExtraVariance,
     Whitener,
-    covariance_of_sums,
     differences_between_repetitions,
     estimate_noise,
     repeating_runs,
@@ -53,18 +50,33 @@ PROBLEM = make_problem()
 RUNS = len(PROBLEM.trajectories)
 
 
-def with_deviations(deviations: Array, values: Array | None = None) -> TrajectoryFit:
-    """The design at the runs, with nuisances that have these standard deviations."""
-    model = OdometryModel.of_design(PROBLEM.robot, "arc")
+def with_deviations(deviations: Array, values: Array | None = None, vector: Array = PROBLEM.start) -> TrajectoryFit:
+    """The fit of a vector, by default the start, with nuisances that have these standard deviations."""
+    model = OdometryModel(PROBLEM.robot, PROBLEM.matrix(vector), PROBLEM.integration)
     nuisances = Nuisances(np.zeros((RUNS, 3)) if values is None else values, deviations)
     return TrajectoryFit(model, PROBLEM.trajectories, nuisances)
 
 
-WEIGHTINGS = whiteners(NOISE, with_deviations(np.zeros(3)).stamps)
+START = with_deviations(np.zeros(3))
+WEIGHTINGS = whiteners(NOISE, START.stamps)
 
 
 def chi2(fit: TrajectoryFit) -> Array:
     return fit.chi_square(WEIGHTINGS)
+
+
+def linearised(fit: TrajectoryFit) -> Whitened:
+    return fit.linearised(fit.matrix_jacobian(), WEIGHTINGS)
+
+
+def test_the_scores_are_the_slopes_of_the_objective() -> None:
+    data = linearised(START)
+    assert np.square(data.residuals).sum() == pytest.approx(chi2(START).sum())
+    for index, step in enumerate(1e-6 * np.eye(PROBLEM.size)):
+        after, before = (
+            chi2(with_deviations(np.zeros(3), None, PROBLEM.start + sign * step)).sum() for sign in (1, -1)
+        )
+        assert data.scores.sum(axis=0)[index] == pytest.approx(-(after - before) / 4e-6, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -84,6 +96,13 @@ def test_steps_of_a_nuisance_lead_to_where_no_run_can_do_better(nuisance: int, d
     for away in (-0.05, 0.05):
         moved = values + away * (np.abs(values) + deviations)
         assert (chi2(with_deviations(deviations, moved)) > (1 - kinks) * there).all()
+
+
+def test_what_nuisances_take_up_is_no_information() -> None:
+    held = linearised(START).information
+    free = linearised(with_deviations(np.array([0.05, 0.2, 0.01]))).information
+    assert np.linalg.eigvalsh(held - free).min() >= -1e-9 * np.linalg.eigvalsh(held).max()
+    assert np.trace(free) < 0.99 * np.trace(held)
 
 
 @given(seed=st.integers(0, 2**31), reach=st.floats(0.01, 10.0))
@@ -193,15 +212,6 @@ def test_whitened_residuals_are_those_of_the_dense_covariance(noise: Noise, stam
     assert np.square(whitener(residuals)).sum() == pytest.approx(squares, rel=1e-6)
     determinant = 2 * np.linalg.slogdet(position)[1] + np.linalg.slogdet(heading)[1]
     assert whitener.log_determinant == pytest.approx(determinant, rel=1e-6, abs=1e-6)
-
-
-@given(noise=NOISES, stamps=STAMPS, seed=st.integers(0, 2**31))
-def test_sums_of_errors_have_the_covariance_that_the_dense_one_gives(noise: Noise, stamps: Array, seed: int) -> None:
-    weights = np.random.default_rng(seed).standard_normal((len(stamps), 2, 4))
-    left = dense(noise.pose_position, noise.walk_position, noise.bias_position, stamps)
-    heading = dense(noise.pose_heading, noise.walk_heading, noise.bias_heading, stamps)
-    expected = weights[:, 0].T @ left @ weights[:, 0] + weights[:, 1].T @ heading @ weights[:, 1]
-    assert_allclose(covariance_of_sums(noise, stamps, weights, [1, 2]), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_derivatives_are_whitened_column_by_column_and_a_bias_alone_can_be_whitened() -> None:
@@ -405,20 +415,8 @@ HEAVY_NOISE = Noise(
 HEAVY_STAMPS = np.array([0.3, 0.5, 1.1, 1.2, 2.0])
 
 
-def covariance(kind: str, of_poses: Array | float = 0.0, of_all: float = 0.0) -> Array:
-    components = (getattr(HEAVY_NOISE, f"{part}_{kind}") for part in ("pose", "walk", "bias"))
-    return dense(*components, HEAVY_STAMPS) + of_all + of_poses * np.eye(5)
-
-
-@given(seed=st.integers(0, 10**6))
-def test_variance_beyond_the_noise_whitens_as_the_dense_covariance_does(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    extra = ExtraVariance((rng.exponential(1e-3, 5), 1e-4), (rng.exponential(1e-3, 5), 0.0))
-    residuals = rng.standard_normal((5, 3))
-    white = Whitener(HEAVY_NOISE, HEAVY_STAMPS, extra)(residuals)
-    position, heading = covariance("position", *extra.position), covariance("heading", *extra.heading)
-    expected = [r @ np.linalg.solve(c, r) for r, c in zip(residuals.T, (position, position, heading), strict=True)]
-    assert np.square(white).sum() == pytest.approx(sum(expected), rel=1e-9)
+def covariance(kind: str) -> Array:
+    return dense(*(getattr(HEAVY_NOISE, f"{part}_{kind}") for part in ("pose", "walk", "bias")), HEAVY_STAMPS)
 
 
 @given(seed=st.integers(0, 10**6))
@@ -430,15 +428,6 @@ def test_what_the_others_say_of_a_pose_is_that_of_the_dense_inverse(seed: int) -
     gain = np.linalg.solve(dense[np.ix_(others, others)], dense[others, 2])
     assert errors[2, 0] == pytest.approx(residuals[2, 0] - gain @ residuals[others, 0], rel=1e-9)
     assert variances[2, 1] == pytest.approx(dense[2, 2] - gain @ dense[others, 2], rel=1e-9)
-
-
-@given(seed=st.integers(0, 10**6))
-def test_the_likeliest_shift_is_that_of_generalised_least_squares(seed: int) -> None:
-    residuals = np.random.default_rng(seed).standard_normal((5, 3))
-    shift, variances = Whitener(HEAVY_NOISE, HEAVY_STAMPS).shift(residuals)
-    inverse = np.linalg.inv(covariance("heading"))
-    assert variances[2] == pytest.approx(1 / inverse.sum(), rel=1e-9)
-    assert shift[2] == pytest.approx(inverse.sum(axis=0) @ residuals[:, 2] / inverse.sum(), rel=1e-9)
 
 
 Split = Literal["train", "validation"]
