@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from types import MappingProxyType
-from typing import ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -398,10 +398,18 @@ class Term:
     values: Values
     weights: str | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For other processes: values that cannot be changed cannot be pickled either."""
+        return _term_of, (self.effect, dict(self.values), self.weights)
+
     @property
     def name(self) -> str:
         """The effect's name."""
         return self.effect.name
+
+
+def _term_of(effect: Effect, values: dict[str, float], weights: str | None) -> Term:
+    return Term(effect, MappingProxyType(values), weights)
 
 
 def make_term(
