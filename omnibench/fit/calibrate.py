@@ -12,13 +12,13 @@ from omnibench.data.splits import training_split
 from omnibench.environment import package_versions
 from omnibench.errors import ConfigError, computable, require_type
 from omnibench.fit.calibrator import Calibrator, RunResult, as_answered, calibration_of_fit, run_calibrator
-from omnibench.fit.estimate import EstimateProblem, corrected_runs, estimate, steering_unknowns
+from omnibench.fit.estimate import Nuisances, corrected_runs, estimate_with_steering, usual_problem
 from omnibench.fit.evaluate import verdict_on
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.open_combinations import open_sentences
 from omnibench.fit.path_errors import slip_of
-from omnibench.fit.prior import default_cost, default_mount, physical_prior_root, physical_tolerance
+from omnibench.fit.prior import default_cost, default_mount
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.span import WheelDirection
@@ -126,10 +126,8 @@ def calibrate(
     runs: Sequence[Trajectory] = training
     if chosen.steering == "fit" and not calibrator.weighs_design:
         watch(Progress("steering"))
-        root = physical_prior_root(robot, physical_tolerance(robot))
-        of_runs = EstimateProblem(robot, training, root, chosen.integration, dataset.sample_period)
-        tries = [estimate(replace(of_runs, unknowns=unknowns)) for unknowns in steering_unknowns(robot)]
-        terms = min(tries, key=lambda tried: tried.error).terms
+        of_runs = replace(usual_problem(robot, training, chosen.integration), unknowns=(), nuisances=Nuisances())
+        terms = estimate_with_steering(of_runs).terms
         runs = corrected_runs(robot, training, terms, dataset.sample_period)
 
     # The answer.
@@ -146,10 +144,12 @@ def calibrate(
             uncertainty = uncertainty_of(problem, result)
         except NoCovarianceError as error:
             without_covariance = str(error)
+
     # The physical parameters, the calibration file, and what the data leave open.
     searched = problem.parameterisation
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
-    fitted_mount = (asked.mount or default_mount(robot)) == "fit"
+    off_centre = calibrator.weighs_design and robot.slides and not robot.skid  # as map's prior has it
+    fitted_mount = (asked.mount or ("fit" if off_centre else default_mount(robot))) == "fit"
     reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
     return CalibrationRun(
         calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),

@@ -43,7 +43,8 @@ class Solution:
 
     converged: False when the calibrator hit a limit of its own (generations, programs) before its stopping rule held.
     Calibrators that estimate them also give the covariance (n, n) of the vector, the degrees_of_freedom of its
-    variances (one number, or (n,)), by which intervals are made, and the noise of the reference poses.
+    variances (one number, or (n,)), by which intervals are made, and the noise of the reference poses; those that weigh
+    the design say in covariance_source what the covariance rests on beside it.
     extension: effects that were fitted beside the matrix; the answer's cost is that of the model with these.
     """
 
@@ -54,6 +55,7 @@ class Solution:
     noise: saved.Noise | None = None
     degrees_of_freedom: Array | float | None = None
     extension: saved.ModelExtension | None = None
+    covariance_source: str = ""
 
 
 class Calibrator(ABC):
@@ -163,6 +165,7 @@ class RunResult(Brief):
     degrees_of_freedom: JsonArray | None = None
     timing: Timing | None = None
     extension: saved.ModelExtension | None = None
+    covariance_source: str = ""
 
 
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
@@ -218,6 +221,7 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         noise=estimate.noise if estimate is not None else None,
         degrees_of_freedom=freedom if estimate is not None else None,
         extension=estimate.extension if estimate is not None else None,
+        covariance_source=estimate.covariance_source if estimate is not None else "",
     )
 
 

@@ -48,19 +48,18 @@ from omnibench.fit.loss import Loss, LossName, Squares, make_loss
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.registry import effects
-from omnibench.robot.corrections import corrected, needs_of
+from omnibench.robot.corrections import driven_signals
 from omnibench.robot.effects.effect import Term, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch, WheelLog
-from omnibench.robot.signals import signals_of
 from omnibench.robot.stored_odometry import together
 
 # 5, 8 and 12 stretches make the same mean error on six real robots within 4 % (the cells of configs/real_robots.yaml).
 _STRETCHES = 5  # stretches that a run's path is cut into; chosen
 _POSES = 12  # most reference poses of a stretch that are looked at: their median is as steady; chosen
 _FIRST, _FIRST_STEPS = 0.01, 4  # m and rad, and steps: see the module's docstring
-_LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
+LEAST = 0.003  # m and rad: smaller errors along a path are those of motion capture, not of the model; chosen
 _STEP = 0.1  # prior deviations by which a parameter of an effect is moved for its derivative
 _MOST_STEPS, _RESTING = 40, 1e-4  # steps, and the largest step, in prior deviations, that counts as none
 _UNTOLD = 1e3  # times its sigma: weight of a position of a run that hardly leaves its place, and tells no heading
@@ -130,7 +129,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class EstimateProblem:
-    """What is estimated from which runs.
+    """The runs, the prior and the options of an estimate.
 
     root (3M, q): of the prior's covariance of the matrix elements about the design. sample_period: nominal, s.
     """
@@ -198,6 +197,15 @@ def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
         )
         for factor in _FACTORS
     ]
+
+
+def estimate_with_steering(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True) -> Estimate:
+    """The estimate with the steering's unknowns beside the problem's, about the gain that explains the runs best.
+
+    ConfigError: the robot has no steering.
+    """
+    tries = [replace(problem, unknowns=(*problem.unknowns, *more)) for more in steering_unknowns(problem.robot)]
+    return min((estimate(tried, may_go_on) for tried in tries), key=lambda tried: tried.error)
 
 
 def estimate(
@@ -350,8 +358,10 @@ class _Rows:
         return np.array(errors), np.concatenate(jacobians) if slopes else np.empty(0)
 
     def _driven(self, terms: Sequence[Term]) -> Iterator[tuple[list[WheelLog], NDArray[np.intp], Array]]:
-        """The logs of runs with poses, corrected by effects, a part at a time; with each part the indices of its
-        stretches' first poses, and the reference poses (K, 3)."""
+        """Logs of the runs with poses, corrected by effects, a part at a time.
+
+        With each part come the indices of its stretches' first poses, and the reference poses (K, 3).
+        """
         number = 0
         for part in together([self._problem.runs[index] for index in self._posed]):
             chosen = self._chosen[number : number + len(part)]
@@ -376,7 +386,7 @@ class _Rows:
             count = len(np.unique(self.run[rows]))
             seen = count / max(count - 1, 1) * float(shares @ np.square(errors[rows, axes])) / shares.sum()
             known = float(shares @ np.square(self.sigmas[rows, axes])) / shares.sum()
-            least = _LEAST if kind in (PLACE, HEADING) else 0.0
+            least = LEAST if kind in (PLACE, HEADING) else 0.0
             values[number] = np.sqrt(max(seen - known, least**2))
         return values
 
@@ -464,10 +474,8 @@ def corrected_runs(
     robot: Robot, runs: Sequence[Trajectory], terms: Sequence[Term], sample_period: float
 ) -> tuple[Trajectory, ...]:
     """Runs whose rates are the drive signals (F, M) of a robot with effects on its wheels and steering angles."""
-    design, needs = robot.inverse_kinematic_matrix, needs_of(terms)
     made = []
     for run in runs:
-        true = corrected(terms, signals_of(run.final_log, robot, design, sample_period, needs))
-        signals = robot.drive.signals(true.rates, true.steering)
+        signals = driven_signals(terms, run.final_log, robot, robot.inverse_kinematic_matrix, sample_period)
         made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
     return tuple(made)

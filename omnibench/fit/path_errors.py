@@ -41,18 +41,17 @@ from scipy.special import ndtri, stdtrit
 
 from omnibench.config import Model
 from omnibench.data.dataset import Trajectory
+from omnibench.fit.estimate import LEAST, USUAL_NUISANCES
 from omnibench.fit.evaluate import looked_at
 from omnibench.robot.calibration import Calibration, Slip
-from omnibench.robot.corrections import corrected, needs_of
+from omnibench.robot.corrections import driven_signals
 from omnibench.robot.effects.effect import Term
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch, WheelLog
 from omnibench.robot.paths import legs_of, usual_paths, wheel_log
-from omnibench.robot.signals import signals_of
 
-# What a run's start and its reference err by, m and rad: as the calibrator map takes them.
-_START_PLACE, _START_HEADING = 0.003, 0.005
+_START_PLACE, _START_HEADING = LEAST, USUAL_NUISANCES[0]  # m and rad: by which a run's start and its reference err
 _LEAST_SLIP = 0.05  # share of the squares of errors that is slip, where the reference alone would explain all; chosen
 _MOST_STEPS = 400_000  # wheel samples of the runs that slip is told from; chosen: a tenth of a second
 _FEWEST = 4  # runs that it is told from, however long they are
@@ -131,10 +130,9 @@ def _slopes(model: OdometryModel, logs: Sequence[WheelLog], covariance: Array) -
     true = list(logs)
     if terms:
         assert model.sample_period is not None  # there are terms
-        needs, true = needs_of(terms), []
+        true = []
         for log in logs:
-            of_log = corrected(terms, signals_of(log, robot, model.matrix, model.sample_period, needs))
-            driven = robot.drive.signals(of_log.rates, of_log.steering)
+            driven = driven_signals(terms, log, robot, model.matrix, model.sample_period)
             true.append(WheelLog(log.times, driven, log.start, log.stamps))
     columns = [OdometryBatch(true, model.integration).jacobian(model.matrix).reshape(len(logs), 3, -1)]
     plain = replace(model, fade=None)

@@ -69,8 +69,8 @@ def default_mount(robot: Robot) -> MountChoice:
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: MountChoice | None = None) -> Array:
     """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 
-    mount: whether the tracked point may stand elsewhere; default: as is usual for the robot. Rows that no wheel drives
-    (the sideways one of a robot that cannot slide) move with the tracked point alone.
+    mount: whether the tracked point may stand elsewhere. None: it may, but of a robot that its fixed wheels keep from
+    sliding to the side alone (a point ahead of the axle would slide), unless ``default_mount`` fits it.
     """
     design, scales = robot.inverse_kinematic_matrix, robot.row_scales
     columns = _wheels_of_columns(robot)
@@ -87,12 +87,18 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: Mount
             turned = np.zeros_like(design)
             turned[:, pair] = design[:, pair] @ np.array([[0.0, -1.0], [1.0, 0.0]])
             roots.append(turned * STEERING_ZERO)
-    if class_of(robot) == "skid":
+    skid = class_of(robot) == "skid"
+    if skid:
         roots += [*(TURNING_CENTRE * changes_by_centre(robot))]
-    if (mount or default_mount(robot)) == "fit":
-        x, y, _ = design
-        roots += [*(TRACKED_POINT * changes_by_centre(robot))]
-        roots += [] if robot.slides else [TRACKED_YAW * np.array([y, -x, np.zeros_like(x)])]
+    ahead, aside = TRACKED_POINT * changes_by_centre(robot)
+    fitted = (mount or default_mount(robot)) == "fit"
+    if fitted or (mount is None and robot.slides and not skid):
+        roots += [ahead, aside]
+    elif mount is None and not skid:
+        roots += [aside]
+    if fitted and not robot.slides:
+        x, y, still = design[0], design[1], np.zeros(design.shape[1])
+        roots += [TRACKED_YAW * np.array([y, -x, still])]
     return np.array([root.ravel() for root in roots]).T
 
 

@@ -177,7 +177,8 @@ class CalibrationProblem(SearchBox):
     rng: the only source of randomness that a calibrator may use.
     span: what the runs drive; default: computed when it is first asked for.
     watch: told the evaluations and the best cost so far, at most every 0.1 s.
-    tolerance: standard deviation of the design's elements, for calibrators that weigh it; None: that of the class.
+    tolerance, mount: standard deviation of the design's elements, and whether the tracked point may stand elsewhere,
+    for calibrators that weigh the design; None: as is usual for the robot's class.
     """
 
     def __init__(
@@ -191,6 +192,7 @@ class CalibrationProblem(SearchBox):
         budget: Budget,
         seed: int,
         tolerance: float | None = None,
+        mount: MountChoice | None = None,
         span: DrivenSpan | None = None,
         watch: Reporter = no_progress,
     ) -> None:
@@ -205,7 +207,7 @@ class CalibrationProblem(SearchBox):
             )
         self.objective = cost
         self.parameterisation = parameterisation
-        self.tolerance = tolerance
+        self.tolerance, self.mount = tolerance, mount
         self.integration: Integration = integration
         self.seed = seed
         self.rng = np.random.default_rng(seed)
@@ -440,6 +442,7 @@ def make_problem(
         budget=settings.budget,
         seed=settings.seed,
         tolerance=settings.tolerance,
+        mount=settings.mount,
         span=span,
         watch=watch,
     )

@@ -102,7 +102,7 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     if result.covariance is None:
         of_vector = _by_scatter(problem, result, clusters)
     else:
-        basis = "likelihood" if result.extension is None else "posterior"
+        basis = "posterior" if result.covariance_source else "likelihood"
         freedom = np.inf if result.degrees_of_freedom is None else result.degrees_of_freedom
         of_vector = EstimatedCovariance(result.covariance, freedom)
     posed = any(run.has_poses for run in problem.trajectories)
@@ -121,7 +121,9 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         degrees_of_freedom=np.broadcast_to(of_elements.degrees_of_freedom, untold.shape),
         noise=noise,
         basis=basis,
-        source="the calibrator's own (see its reason)" if basis == "likelihood" else clusters.words,
+        source={"likelihood": "the calibrator's own (see its reason)", "posterior": result.covariance_source}.get(
+            basis, clusters.words
+        ),
     )
 
 
@@ -275,12 +277,13 @@ def physical_parameters(
         covariance, freedom = uncertainty.covariance, uncertainty.degrees_of_freedom
     if result.extension is not None and result.extension.covariance is not None:
         covariance = np.array(result.extension.covariance)
-        freedom = max(len(Clusters.of(problem.trajectories).members) - 1, 1)
+        of_elements = np.broadcast_to(freedom, result.matrix.size)  # effects scatter at least as freely as these
+        freedom = np.append(of_elements, np.full(len(covariance) - len(of_elements), of_elements.min()))
     held = _not_moved(problem, result)
-    unknown = [problem.parameterisation.slopes(result.vector)[:, held].T]
-    if uncertainty is None or uncertainty.basis != "posterior":  # which the design tells, too
+    unknown, weighed = [problem.parameterisation.slopes(result.vector)[:, held].T], bool(result.covariance_source)
+    if not weighed:  # otherwise the design tells of them, too
         unknown.append(np.kron(np.eye(3), problem.unidentified))
-    if problem.left_open is not None and (uncertainty is None or uncertainty.basis != "posterior"):
+    if problem.left_open is not None and not weighed:
         unknown.append(problem.left_open * np.repeat(problem.robot.row_scales, result.matrix.shape[1]))
     return read_matrix(
         problem.robot,

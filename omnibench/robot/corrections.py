@@ -16,7 +16,7 @@ from omnibench.errors import DataError, PluginError
 from omnibench.robot.effects.effect import MotionEffect, Need, Term, correction_of
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
-from omnibench.robot.signals import Signals, needed
+from omnibench.robot.signals import Signals, needed, signals_of
 
 _MISSING: dict[Need, str] = {
     "wheel_angles": "absolute wheel angles (phi_* in wheels), which were not recorded",
@@ -88,6 +88,12 @@ def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> 
     if true.body is None:
         return twists, true.world
     return twists + (true.body if mount is None else true.body @ mount.twist.T), true.world
+
+
+def driven_signals(terms: Sequence[Term], log: WheelLog, robot: Robot, matrix: Array, sample_period: float) -> Array:
+    """The drive signals (F, M) of a log as effects on wheels and steering correct them; sample_period: nominal, s."""
+    true = corrected(terms, signals_of(log, robot, matrix, sample_period, needs_of(terms)))
+    return robot.drive.signals(true.rates, true.steering)
 
 
 def needs_of(terms: Sequence[Term]) -> frozenset[Need]:

@@ -20,17 +20,15 @@ from omnibench.fit.calibrator import Calibrator, Solution
 from omnibench.fit.estimate import (
     LOST_RATE,
     USUAL_NUISANCES,
-    Estimate,
     EstimateProblem,
     Nuisances,
     Unknown,
     estimate,
-    steering_unknowns,
+    estimate_with_steering,
 )
-from omnibench.fit.jackknife import FEWEST_SESSIONS, Clusters, jackknife
+from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.motion_windows import windows_of
-from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
@@ -39,8 +37,10 @@ from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_r
 # Wheel samples of the runs that are looked at, 3 hours at 100 Hz: more runs say no more of a robot than slip lets them,
 # and take minutes; chosen.
 _MOST_SAMPLES = 1_000_000
-_WINDOW = 12.0  # s, of the parts of one or two long runs; chosen, as recordings of one drive are cut on import
-_MOST_STEPS = 40  # of the estimate, for its progress
+# s: parts of a single long run, as recordings of one drive are cut on import. Of two runs of OptiOdom robots cut like
+# that the error on others is up to twice as large as of the whole ones.
+_WINDOW = 12.0
+_MOST_STEPS = 40  # steps that the progress of an estimate counts to
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
 
 
@@ -85,47 +85,36 @@ class Map(Calibrator):
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Gauss-Newton steps to the minimum. DataError: no run has a reference after its start."""
         self.needs_matrix(problem)
-        robot, options, searched = problem.robot, self.options, problem.parameterisation
-        assert isinstance(searched, MatrixElements)
+        robot, options = problem.robot, self.options
         tolerance = physical_tolerance(robot)
-        if problem.tolerance is not None:  # of the elements, and nothing else
+        if problem.tolerance is not None:  # only the elements are off their design then
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
         runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
-        if len(Clusters.of(runs).members) < FEWEST_SESSIONS:  # of a run or two nothing says how far they scatter
-            runs = [
-                window
-                for run in runs
-                for window in (windows_of(run, max(int(run.end / _WINDOW), 1)) if run.has_poses else [run])
-            ]
+        if len(runs) == 1 and runs[0].has_poses:  # a single run does not say how far runs scatter, its windows do
+            runs = list(windows_of(runs[0], max(int(runs[0].end / _WINDOW), 1)))
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
 
-        root = physical_prior_root(robot, tolerance, "known" if searched.known_mount else "fit")
-
-        def most_probable(unknowns: tuple[Unknown, ...], near: Estimate | None = None) -> Estimate:
-            of_runs = EstimateProblem(
-                robot,
-                runs,
-                searched.projection @ root,
-                problem.integration,
-                problem.sample_period,
-                unknowns,
-                Nuisances(options.start_heading, *clock),
-                "huber" if loss == "squares" else loss,
-            )
-            return estimate(of_runs, may_go_on, near)
+        of_runs = EstimateProblem(
+            robot,
+            runs,
+            problem.parameterisation.projection @ physical_prior_root(robot, tolerance, problem.mount),
+            problem.integration,
+            problem.sample_period,
+            (Unknown(*LOST_RATE, lost),) if lost else (),
+            Nuisances(options.start_heading, *clock),
+            "huber" if loss == "squares" else loss,
+        )
 
         def may_go_on(steps: int) -> bool:
             problem.report(steps, _MOST_STEPS, "step")
             return problem.seconds_left > 0
 
-        of_wheels = (Unknown(*LOST_RATE, lost),) if lost else ()
         if options.steering == "fit":
-            steered = steering_unknowns(robot)
-            found = min((most_probable((*of_wheels, *unknowns)) for unknowns in steered), key=lambda tried: tried.error)
+            found = estimate_with_steering(of_runs, may_go_on)
         else:
-            found = most_probable(of_wheels)
+            found = estimate(of_runs, may_go_on)
         clusters = Clusters.of(runs)
         unit = np.eye(found.root.shape[1])
         covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
@@ -135,7 +124,7 @@ class Map(Calibrator):
             extension = ModelExtension(
                 effects=tuple(map(EffectTerm.of, found.terms)),
                 covariance=covariance_rows(covariance.matrix),
-                plain=matrix_rows(most_probable((), found).matrix),
+                plain=matrix_rows(estimate(replace(of_runs, unknowns=()), may_go_on, found).matrix),
             )
         if len(runs) < len(problem.trajectories):
             end += f" with {len(runs):,} of {len(problem.trajectories):,} runs, which chance has drawn"
@@ -147,9 +136,10 @@ class Map(Calibrator):
         freedom = np.broadcast_to(covariance.degrees_of_freedom, len(found.root))[:size]
         return Solution(
             found.matrix.ravel(),
-            f"{end}; intervals: {clusters.words}",
+            end,
             converged=found.at_rest,
             covariance=covariance.matrix[:size, :size],
             degrees_of_freedom=np.array(freedom),
             extension=extension,
+            covariance_source=clusters.words,
         )
