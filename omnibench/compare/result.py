@@ -29,7 +29,7 @@ from omnibench.views import Shown
 THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
 
 
-_DEVIATIONS = ("deviation", "deviation_percent")  # which a row of summary.json has beside value and design
+_DEVIATIONS = ("deviation", "deviation_percent")  # keys of summary.json that follow from value and design
 
 
 def _row(parameter: PhysicalParameter) -> dict[str, Any]:

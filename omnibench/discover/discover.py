@@ -386,7 +386,7 @@ def _calibration_of(
         driven=tuple(tuple(float(value) for value in motion) for motion in validating.training_domain(extended)),
         plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
     )
-    with suppress(DataError):  # as for the costs: runs may lack what an effect needs
+    with suppress(DataError):  # runs may lack what an effect needs: no slip then
         return calibration.model_copy(update={"slip": slip_of(calibration, dataset.split("train"))})
     return calibration
 

@@ -128,7 +128,8 @@ def _gain_in_words(gain: Interval | None, units: Units) -> str:
     if gain.known is not None:
         low, high = sorted(end if gain.value >= 0 else -end for end in gain.known)
         basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.words}"
-    return f"Eq. (6) {'falls' if gain.value >= 0 else 'rises'} by {100 * abs(gain.value):.1f} % ({basis}); "
+    direction = "falls" if gain.value >= 0 else "rises"
+    return f"the final error, Eq. (6), {direction} by {100 * abs(gain.value):.1f} % ({basis}); "
 
 
 def _change(before: float, after: float, unit: str) -> str:

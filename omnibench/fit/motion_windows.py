@@ -110,8 +110,8 @@ def windows_of(run: Trajectory, count: int) -> Iterator[Trajectory]:
     if count == 1:
         yield run
         return
-    wanted = np.linspace(0.0, run.end, count + 1)
-    edges = np.unique(np.clip(np.searchsorted(run.pose_times, wanted), 0, len(run.pose_times) - 1))
+    bounds = np.linspace(0.0, run.end, count + 1)
+    edges = np.unique(np.clip(np.searchsorted(run.pose_times, bounds), 0, len(run.pose_times) - 1))
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         begin, end = float(run.pose_times[first]), float(run.pose_times[last])
         driven = slice(*np.searchsorted(run.times, [begin, end], side="right").tolist())

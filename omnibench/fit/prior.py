@@ -66,6 +66,11 @@ def default_mount(robot: Robot) -> MountChoice:
     return "fit" if class_of(robot) in _UNKNOWN_MOUNTS else "known"
 
 
+def off_centre(robot: Robot) -> bool:
+    """True if the prior lets the tracked point stand off the centre both ways; a skid-steered base's centre wanders."""
+    return robot.slides and not robot.skid
+
+
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: MountChoice | None = None) -> Array:
     """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 
@@ -87,14 +92,13 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: Mount
             turned = np.zeros_like(design)
             turned[:, pair] = design[:, pair] @ np.array([[0.0, -1.0], [1.0, 0.0]])
             roots.append(turned * STEERING_ZERO)
-    skid = class_of(robot) == "skid"
-    if skid:
+    if robot.skid:
         roots += [*(TURNING_CENTRE * changes_by_centre(robot))]
     ahead, aside = TRACKED_POINT * changes_by_centre(robot)
     fitted = (mount or default_mount(robot)) == "fit"
-    if fitted or (mount is None and robot.slides and not skid):
+    if fitted or (mount is None and off_centre(robot)):
         roots += [ahead, aside]
-    elif mount is None and not skid:
+    elif mount is None and not robot.skid:
         roots += [aside]
     if fitted and not robot.slides:
         x, y, still = design[0], design[1], np.zeros(design.shape[1])

@@ -76,7 +76,8 @@ class FitSettings(Model):
         None, description="Of the design, for map: share of each row's largest element. Default: by class."
     )
     mount: MountChoice | None = Field(
-        None, description="fit: where the tracked point stands. Default: known, but for tricycles and cars."
+        None,
+        description="fit: where the tracked point stands. Default: for tricycles and cars, by map where robots slide.",
     )
     steering: SteeringChoice = Field(
         "known", description="fit: also find its gain, play and coupling, or a car's zero."

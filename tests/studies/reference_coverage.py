@@ -140,7 +140,7 @@ def simulated(robot: str, seed: int, encoder: float = 0.02) -> tuple[Dataset, np
 
 
 def _true_matrix(robot: Robot, rng: np.random.Generator) -> np.ndarray:
-    design, root = robot.inverse_kinematic_matrix, physical_prior_root(robot, physical_tolerance(robot))
+    design, root = robot.inverse_kinematic_matrix, physical_prior_root(robot, physical_tolerance(robot), "known")
     off = (root @ rng.normal(size=root.shape[1])).reshape(design.shape)
     off[1] *= bool(design[1].any())  # a robot on two fixed wheels does not slide
     moved: np.ndarray = design + off

@@ -186,6 +186,8 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print cost and final errors on every split, beside those of the design values."""
     rows = []
     for split in evaluation.splits:
+        if split == "all" and len(evaluation.splits) > 2:  # the lines above say it
+            continue
         title = f"{split}: {plural(evaluation.splits[split].trajectories, 'run')}"
         if evaluation.unfitted is not None:
             part, whole = evaluation.unfitted[split], evaluation.splits[split].trajectories
@@ -206,12 +208,12 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
             rows.append(Row.of(label, *figures))
     columns = (
         Column("model", numeric=False),
-        Column("cost, Eq. (6)"),
+        Column("error, Eq. (6)"),
         *(Column(f"position, {which}", "m") for which in ("mean", "max")),
         *(Column(f"heading, {which}", "deg") for which in ("mean", "max")),
     )
     kind = " (simulated data)" if evaluation.simulated else ""
-    note = f"fitted with the loss {evaluation.loss}; cost and errors are without it" if evaluation.loss else ""
+    note = f"fitted with the loss {evaluation.loss}; the errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
     _print_reference_errors(console, evaluation)
 

@@ -117,7 +117,7 @@ def _fitted(view: sets.DatasetView) -> list[tuple[page.LegendItem, Robot]]:
         return []
     robot = view.dataset.robot
     fitted = {each.name: each.value for each in read_matrix(robot, best.typical.matrix).parameters}
-    if not fitted or class_of(robot) != "omni" or len(robot.wheels) != 3:  # of others it is no one geometry
+    if not fitted or class_of(robot) != "omni" or len(robot.wheels) != 3:  # the matrix of others has many geometries
         return []
     wheels = []
     for wheel in robot.wheels:

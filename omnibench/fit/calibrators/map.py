@@ -29,7 +29,7 @@ from omnibench.fit.estimate import (
 from omnibench.fit.jackknife import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.motion_windows import windows_of
-from omnibench.fit.prior import physical_prior_root, physical_tolerance
+from omnibench.fit.prior import default_mount, physical_prior_root, physical_tolerance
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.calibration import EffectTerm, ModelExtension, covariance_rows, matrix_rows
@@ -86,8 +86,9 @@ class Map(Calibrator):
         """Gauss-Newton steps to the minimum. DataError: no run has a reference after its start."""
         self.needs_matrix(problem)
         robot, options = problem.robot, self.options
-        tolerance = physical_tolerance(robot)
+        tolerance, mount = physical_tolerance(robot), problem.mount
         if problem.tolerance is not None:  # only the elements are off their design then
+            mount = mount or default_mount(robot)
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
         runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
         if len(runs) == 1 and runs[0].has_poses:  # a single run does not say how far runs scatter, its windows do
@@ -99,7 +100,7 @@ class Map(Calibrator):
         of_runs = EstimateProblem(
             robot,
             runs,
-            problem.parameterisation.projection @ physical_prior_root(robot, tolerance, problem.mount),
+            problem.parameterisation.projection @ physical_prior_root(robot, tolerance, mount),
             problem.integration,
             problem.sample_period,
             (Unknown(*LOST_RATE, lost),) if lost else (),
