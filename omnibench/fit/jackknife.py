@@ -9,9 +9,16 @@ Of G clusters the jackknife has the covariance, beside that of the prior with it
 
     (G - 1) / G sum_c d_c d_c'  +  H^-1 P H^-1,                                                            (2)
 
-with G - 1 degrees of freedom for the first part (Tukey 1958; the CV3 of MacKinnon, Nielsen and Webb, J. Appl. Econom.
-38:671, 2023) and none to be known for the second. What the model cannot express, and slip, are the same in the runs of
-a cluster; they count, since other clusters would have others.
+(Tukey 1958; the CV3 of MacKinnon, Nielsen and Webb, J. Appl. Econom. 38:671, 2023). What the model cannot express,
+and slip, are the same in the runs of a cluster; they count, since other clusters would have others.
+
+The clusters that tell of a number are often few: of five commands two may turn the robot. With v_c = a'd_c for the
+function a of the unknowns, and M the covariance of these v_c if the slopes of clusters have H_c for theirs, the first
+part of its variance has the degrees of freedom (Satterthwaite 1946; Bell and McCaffrey, Surv. Methodol. 28:169, 2002)
+
+    (tr M)^2 / tr M^2,    M = diag(u_c' H_c u_c) - U (H^-1 + H^-1 P H^-1) U',                             (2a)
+
+u_c = (H - H_c)^-1 a, and H_c u_c the rows of U. The second part is exact.
 
 Where leaving a cluster out loses a direction, no other cluster says how far an estimate scatters along it. With the
 data's Hessian D = sum_c H_c in units of which D is 1, these are the directions v of
@@ -74,12 +81,14 @@ class Clusters:
         return f"{basis}, of one session alone" if self.sessions == 1 else basis
 
 
-def jackknife(information: Array, scores: Array, clusters: Clusters, prior: Array | None = None) -> EstimatedCovariance:
-    """Eq. (2), with the degrees of freedom (k,) of each variance.
+def jackknife(
+    information: Array, scores: Array, clusters: Clusters, prior: Array | None = None, functions: Array | None = None
+) -> EstimatedCovariance:
+    """Eq. (2) of some functions of the unknowns, with the degrees of freedom (q,) of each variance.
 
     information (Z, k, k), scores (Z, k): Hessians and slopes of the runs' parts of what was minimised. prior (k, k): P;
-    None: no prior. Directions of which neither runs nor prior say anything have no variance. A single cluster has the
-    curvature's covariance.
+    None: no prior. functions (q, k): their derivatives by the unknowns; None: the unknowns themselves. Directions of
+    which neither runs nor prior say anything have no variance. A single cluster has the curvature's covariance.
     """
     by_cluster = np.array([information[list(members)].sum(axis=0) for members in clusters.members])
     slopes = np.array([scores[list(members)].sum(axis=0) for members in clusters.members])
@@ -87,26 +96,37 @@ def jackknife(information: Array, scores: Array, clusters: Clusters, prior: Arra
     count, data = len(by_cluster), by_cluster.sum(axis=0)
     roots = roots_of(data + prior)  # H = 1 in these coordinates
     by_cluster, slopes, own = roots.T @ by_cluster @ roots, slopes @ roots, roots.T @ prior @ roots
+    wanted = roots if functions is None else functions @ roots
     whole = np.eye(roots.shape[1])
     of_data = whole - own
     if count == 1:
-        scatter = of_data
-    else:
-        alone = _carried_by_one(by_cluster, of_data)
-        others = whole - alone @ alone.T
-        # Along directions that one cluster alone carries, H - H_c may be singular: they are left out of Eq. (1)
-        kept = [others @ (whole - of_one) @ others + alone @ alone.T for of_one in by_cluster]
-        moved = np.array([others @ np.linalg.solve(left, others @ g) for left, g in zip(kept, slopes, strict=True)])
-        scatter = (count - 1) / count * moved.T @ moved
-        if alone.shape[1]:
-            seen = float(np.trace(others @ of_data))
-            ratio = float(np.trace(scatter)) / seen if seen > _LEAST_LEFT else 1.0
-            scatter = scatter + ratio * alone @ (alone.T @ of_data @ alone) @ alone.T
-    shares = np.diag(roots @ scatter @ roots.T), np.diag(roots @ (scatter + own) @ roots.T)
+        return EstimatedCovariance(wanted @ wanted.T, MANY)
+    alone = _carried_by_one(by_cluster, of_data)
+    others = whole - alone @ alone.T
+    # Along directions that one cluster alone carries, H - H_c may be singular: they are left out of Eq. (1)
+    kept = [others @ (whole - of_one) @ others + alone @ alone.T for of_one in by_cluster]
+    without = np.array([others @ np.linalg.solve(left, others) for left in kept])
+    moved = np.einsum("cij,cj->ci", without, slopes)
+    scatter = (count - 1) / count * moved.T @ moved
+    if alone.shape[1]:
+        seen = float(np.trace(others @ of_data))
+        ratio = float(np.trace(scatter)) / seen if seen > _LEAST_LEFT else 1.0
+        scatter = scatter + ratio * alone @ (alone.T @ of_data @ alone) @ alone.T
+    # Eq. (2a), by the traces of M
+    pulls = np.einsum("cij,qj->qci", without, wanted)
+    rows = np.einsum("cij,qcj->qci", by_cluster, pulls)
+    inner = whole + own
+    single = np.einsum("qci,qci->qc", pulls, rows)
+    shared = np.einsum("qci,ij,qcj->qc", rows, inner, rows)
+    products = inner @ np.einsum("qci,qcj->qij", rows, rows)
+    squares = np.square(single).sum(axis=1) - 2 * (single * shared).sum(axis=1)
+    squares += np.einsum("qij,qji->q", products, products)
+    expected = (single - shared).sum(axis=1)
+    freedom = np.where(squares > 0, np.square(expected) / np.maximum(squares, 1e-300), count - 1)
+    shares = np.diag(wanted @ scatter @ wanted.T), np.diag(wanted @ (scatter + own) @ wanted.T)
     of_scatter = np.clip(shares[0] / np.maximum(shares[1], 1e-300), 1e-9, 1.0)
-    # The prior's part is exact, so that the scatter's share in the variance says its freedom (Satterthwaite 1946)
-    freedom = np.minimum(max(count - 1, 1) / np.square(of_scatter), MANY)
-    return EstimatedCovariance(roots @ (scatter + own) @ roots.T, freedom if count > 1 else MANY)
+    freedom = np.clip(freedom, 1.0, count - 1) / np.square(of_scatter)
+    return EstimatedCovariance(wanted @ (scatter + own) @ wanted.T, np.minimum(freedom, MANY))
 
 
 def _carried_by_one(by_cluster: Array, data: Array) -> Array:

@@ -118,7 +118,7 @@ class Map(Calibrator):
             found = estimate(of_runs, may_go_on)
         clusters = Clusters.of(runs)
         unit = np.eye(found.root.shape[1])
-        covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
+        covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
         end = f"{'' if found.at_rest else 'not '}at rest after {found.steps} steps"
         extension, size = None, found.matrix.size
         if found.terms:
