@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from motions import FLOWER, driven
 
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.uncertainty import sum_of_norms, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
@@ -27,19 +27,19 @@ def clusters_of(keys: Sequence[tuple[str | None, str | None]]) -> Clusters:
 
 def test_three_sessions_are_the_clusters() -> None:
     found = clusters_of([(name, "go") for name in "aabcb"])
-    assert (found.name, found.members) == ("session", ((0, 1), (2, 4), (3,)))
+    assert (found.name, found.of_run.tolist()) == ("session", [0, 0, 1, 2, 1])
     assert found.words == "jackknife over 3 sessions"
 
 
 def test_commands_are_the_clusters_where_runs_repeat_some_and_sessions_are_two() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("b", "go"), ("b", None)])
-    assert (found.name, found.members) == ("command", ((0, 2), (1,), (3,)))
+    assert (found.name, found.of_run.tolist()) == ("command", [0, 1, 0, 2])
     assert found.words == "jackknife over 3 commands"
 
 
 def test_runs_are_the_clusters_where_no_command_is_repeated() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("a", None)])
-    assert (found.name, len(found.members)) == ("run", 3)
+    assert (found.name, found.count) == ("run", 3)
     assert found.words == "jackknife over 3 runs, of one session alone"
 
 
@@ -52,7 +52,7 @@ def test_a_single_run_has_the_curvature_and_it_is_said() -> None:
 
 
 def each_alone(count: int) -> Clusters:
-    return Clusters("run", tuple((number,) for number in range(count)), 1)
+    return Clusters("run", np.arange(count))
 
 
 def least_squares(columns: Array, values: Array) -> Array:
