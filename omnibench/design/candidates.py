@@ -40,12 +40,11 @@ from omnibench.simulate.commands import (
     TimedCommand,
     beyond_steering,
     default_directions,
+    is_within,
     steering_limit,
-    unsteerable,
     wheels_of,
 )
-from omnibench.simulate.config import SteeringLimit
-from omnibench.simulate.robot_config import RobotConfig
+from omnibench.simulate.config import RobotConfig, SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for, plural
@@ -135,9 +134,9 @@ class DesignConfig(Model):
             commands = self.commands(name)
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
-            chosen = [timed.command for timed in commands]
-            if beyond := unsteerable(self.robot, chosen, self.steering_limit_deg):
-                why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
+            limit, chosen = steering_limit(self.robot, self.steering_limit_deg), [timed.command for timed in commands]
+            if not all(is_within(self.robot, command, limit) for command in chosen):
+                why = beyond_steering(self.robot, chosen, limit)
                 raise ValueError(f"sets.{name}: {why}; take such commands out")
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:

@@ -15,7 +15,7 @@ from omnibench.registry import effects
 from omnibench.robot.effects import effect as contract
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.robot.signals import Caster, Signals, SteeringGears
-from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
+from omnibench.testing.cases import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.synthetic import synthetic_robot, synthetic_robots
 
 PERIOD: Final = 0.01  # s, of the wheel samples
@@ -98,10 +98,10 @@ def without(effect: contract.Effect, robot: Robot, values: contract.Values) -> c
 
 def trial_input(effect: contract.Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
     """Input for an effect of this kind; speed as for ``driven_signals``."""
-    if isinstance(effect, contract.MotionEffect):
-        return driven_signals(robot, samples, speed)
-    if isinstance(effect, contract.ActuatorEffect):
-        return motor_input(robot, samples, speed)
+    if not isinstance(effect, contract.ReferenceEffect):
+        signals = driven_signals(robot, samples, speed)
+        motors = np.full(samples, PERIOD), signals.rates
+        return motors if isinstance(effect, contract.ActuatorEffect) else signals
     poses = trial_poses(samples)
     return 0.25 * np.arange(1, samples + 1), poses[0] + speed * (poses - poses[0]), poses[0]
 
@@ -110,11 +110,6 @@ def trial_poses(count: int = SAMPLES) -> Array:
     """Poses (K, 3) on a curved path away from the origin."""
     angle = np.linspace(0.4, 2.4, count)
     return np.column_stack([1.0 + np.cos(angle), -2.0 + np.sin(2 * angle), 0.3 + angle])
-
-
-def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Motors:
-    """Durations (F,), s, and target rates (F, N), rad/s, of a varied drive."""
-    return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
 
 
 def results(effect: contract.Effect, inputs: Input, values: contract.Values) -> dict[str, Array]:
@@ -201,9 +196,8 @@ class EffectConformance(Conformance):
             parameters = self.make().parameters(robot, SESSIONS)
             valid = isinstance(parameters, tuple) and all(isinstance(item, contract.Parameter) for item in parameters)
             require(valid, "parameters must give a tuple of Parameter")
-            require(
-                any(not item.choices for item in parameters), "it needs a parameter without choices, 0 for no effect"
-            )
+            acts = any(not item.choices for item in parameters)
+            require(acts, "it needs a parameter without choices, 0 for no effect")
             for parameter in parameters:
                 place, low, high = f"parameter {parameter.name!r}", parameter.low, parameter.high
                 named = bool(parameter.name) and parameter.name.isprintable()
@@ -343,7 +337,8 @@ class EffectConformance(Conformance):
         if not isinstance(effect, contract.ActuatorEffect):
             raise SkipTest("only for effects of the motors")
         for robot, values in trials(effect):
-            durations, targets = motor_input(robot)
+            targets = driven_signals(robot).rates
+            durations = np.full(SAMPLES, PERIOD)
             early = effect.driven(durations[:50], targets[:50], values)
             same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
             require(same, "later targets change earlier wheel rates")
