@@ -155,8 +155,8 @@ class TrueRobot:
             for term in terms:
                 if term.name in physics.STEERING:
                     ends = physics.steering_truth(term.name, term.values, ends, durations)
-            changed = kinematics.in_the_middle(ends) - kinematics.in_the_middle(log.steering)
-            true = replace(true, steering=true.steering + changed)
+            turned_to = true.steering + kinematics.in_the_middle(ends) - kinematics.in_the_middle(log.steering)
+            true = replace(true, steering=turned_to)
             for term in terms:
                 if term.name == physics.COUPLING:
                     turned = physics.turned_by_steering(term.values, robot.wheels, log.steering, durations)
