@@ -253,15 +253,9 @@ def to_json(document: BaseModel | Mapping[str, Any]) -> str:
 
 def as_yaml(value: Any) -> str:
     """A value as ``--set`` takes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, str):
         plain = value and all(letter.isalnum() or letter in "._/*-" for letter in value) and value[0] != "*"
         return value if plain and parse_yaml(value, "value") == value else json.dumps(value)
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    if isinstance(value, Mapping):
-        return json.dumps(value)
     if isinstance(value, list | tuple):
         return f"[{','.join(as_yaml(item) for item in value)}]"
-    return str(value)
+    return json.dumps(int(value) if isinstance(value, float) and value.is_integer() else value)

@@ -197,10 +197,7 @@ def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = ma
     """
     limit = runs if candidates.most is None else candidates.most
     if limit * len(candidates) < runs:
-        raise ValueError(
-            f"{plural(len(candidates), 'candidate')}, each driven at most {plural(limit, 'time')}, cannot make "
-            f"{plural(runs, 'run')}"
-        )
+        raise ValueError(f"{len(candidates)} candidates, each at most {limit} times, cannot make {plural(runs, 'run')}")
     wanted = shares / candidates.costs
     wanted = runs * wanted / wanted.sum()
     counts: Counts = np.minimum(np.floor(wanted + _ROUNDING).astype(np.intp), limit)

@@ -335,8 +335,7 @@ class DrivableCommands:
         sharpest = sharpest_turn(self.robot, Command(1.0, direction, 1 / SHORTEST, pivot), self.steering_limit)
         if not sharpest:
             return []
-        tightest = 1 / sharpest
-        return [rounded_down(_ROOM_TO_STEER * tightest), *radii] if tightest > SHORTEST else radii
+        return [rounded_down(_ROOM_TO_STEER * (1 / sharpest)), *radii] if 1 / sharpest > SHORTEST else radii
 
     def _drivable(self, direction: float, curvature: float, pivot: tuple[float, float], pace: float) -> Command | None:
         """The fastest command of a shape within the limits, times a pace; None beyond the steering limit.
@@ -356,19 +355,17 @@ class DrivableCommands:
         return float(min(limits))
 
     def _of_length(self, command: Command, durations: list[float]) -> Iterator[TimedCommand]:
-        """The command for those durations, s, that are neither too long nor lead out of the area."""
+        """The command for those durations, s, that are neither too short or long nor lead out of the area, from some
+        start and heading."""
         for duration in durations:
-            long_enough = not command.speed or command.speed * duration >= SHORTEST
-            if long_enough and duration <= LONGEST and self._fits(command.twist * duration):
+            if duration > LONGEST or 0 < command.speed * duration < SHORTEST:
+                continue
+            motion = TrueMotion(np.ones(1), np.zeros(3), command.twist[None] * duration, "arc")
+            path = motion.poses(np.linspace(0.0, 1.0, _POINTS))
+            turned = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * _HEADINGS)[:, None]
+            wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
+            if ((wide <= self.free[0] + 1e-9) & (deep <= self.free[1] + 1e-9)).any():
                 yield TimedCommand(command, duration)
-
-    def _fits(self, moved: Array) -> bool:
-        """True if the path of a constant twist stays in the area from some start and heading. moved (3,): m, m, rad."""
-        path = TrueMotion(np.ones(1), np.zeros(3), moved[None], "arc").poses(np.linspace(0.0, 1.0, _POINTS))
-        places = path[:, 0] + 1j * path[:, 1]
-        turned = places * np.exp(1j * _HEADINGS)[:, None]
-        wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
-        return bool(((wide <= self.free[0] + 1e-9) & (deep <= self.free[1] + 1e-9)).any())
 
 
 def rounded_down(value: float, digits: int = 2) -> float:

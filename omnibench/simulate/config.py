@@ -92,9 +92,7 @@ class Truth(Model):
         if given.distance and not all(placed_by_distance):
             raise ValueError("truth.tolerances.distance: wheels that are placed by x and y have position (m) instead")
         if given.position and all(placed_by_distance):
-            raise ValueError(
-                "truth.tolerances.position: these wheels have no x and y; give distance (relative) instead"
-            )
+            raise ValueError("truth.tolerances.position: these wheels have no x and y; give distance (relative)")
         if given.steering_deg and not robot.drive.steered:
             raise ValueError("truth.tolerances.steering_deg: no steering angle of this robot is measured; leave it out")
         if self.lateral_friction and not (robot.skid and self.tolerances):
@@ -232,10 +230,7 @@ class FlowerConfig(Experiment[Session]):
             )
         runs = sum(each.repetitions for each in planned)
         if runs > _MOST_RUNS:
-            raise ValueError(
-                f"this is {runs} runs, more than {_MOST_RUNS}; give fewer speeds, directions, rates of turn or "
-                "repetitions"
-            )
+            raise ValueError(f"this is {runs} runs, more than {_MOST_RUNS}; give fewer commands or repetitions")
         return self
 
     @property

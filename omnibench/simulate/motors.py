@@ -23,7 +23,7 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
 from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.simulate.commands import Command, wheels_of
+from omnibench.simulate.commands import Command, rounded_down, wheels_of
 from omnibench.words import plural
 
 TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
@@ -112,13 +112,13 @@ def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequen
     motors = motors_of_wheels(motor, len(robot.wheel_names))
     limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
     for command in commands:
-        rates, _ = wheels_of(robot, command.twist)
-        wheel = int(np.argmax(np.abs(rates) / limits))
-        if abs(rates[wheel]) > limits[wheel]:
+        rates = np.abs(wheels_of(robot, command.twist)[0])
+        wheel = int(np.argmax(rates / limits))
+        if rates[wheel] > limits[wheel]:
             raise ConfigError(
                 f"command {command.name} (speed {command.speed:g} m/s, direction {math.degrees(command.direction):g} "
                 f"deg, turn rate {command.turn_rate:g} rad/s) is faster than the motors can go: wheel "
-                f"{robot.wheel_names[wheel]} would need {abs(rates[wheel]):.4g} rad/s, its motor reaches "
+                f"{robot.wheel_names[wheel]} would need {rates[wheel]:.4g} rad/s, its motor reaches "
                 f"{motors[wheel].fastest_rate:.4g} rad/s, of which the controller keeps {_RESERVE:.0%}; "
                 f"{_way_out(robot, command, limits)}"
             )
@@ -126,37 +126,31 @@ def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequen
 
 def _way_out(robot: Robot, command: Command, limits: Array) -> str:
     """Advice: the greatest speed at this rate of turn; if there is none, the greatest rate of turn."""
+    turning = abs(command.turn_rate)
     if not robot.drive.direct:
         share = float(np.min(limits / np.maximum(np.abs(wheels_of(robot, command.twist)[0]), 1e-9)))
         if not command.speed:
-            return f"give it a turn rate of at most {_rounded_down(share * abs(command.turn_rate))} rad/s"
-        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s, and a turn rate as much lower"
+            return f"give it a turn rate of at most {rounded_down(share * turning, 3):g} rad/s"
+        return (
+            f"give it a speed of at most {rounded_down(share * command.speed, 3):g} m/s, and a turn rate as much lower"
+        )
     straight, across, turn = (robot.signal_equations * command.twist).T
     travel = straight + across
     left = limits - np.abs(turn)
     if command.speed and (left > 0).all():
         rooms = np.where(travel * turn >= 0, left, limits + np.abs(turn))
-        share = np.min(rooms[travel != 0] / np.abs(travel[travel != 0]))
-        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s"
-    greatest = _rounded_down(abs(command.turn_rate) * np.min(limits[turn != 0] / np.abs(turn[turn != 0])))
-    return f"turning at more than {greatest} rad/s alone is too fast; give it a lower turn rate" + (
-        " and speed" if command.speed else ""
-    )
-
-
-def _rounded_down(value: float) -> str:
-    """The value with three digits, rounded down."""
-    digits = 2 - math.floor(math.log10(value))
-    return f"{math.floor(value * 10.0**digits) / 10.0**digits:g}"
+        share = float(np.min(rooms[travel != 0] / np.abs(travel[travel != 0])))
+        return f"give it a speed of at most {rounded_down(share * command.speed, 3):g} m/s"
+    greatest = rounded_down(turning * float(np.min(limits[turn != 0] / np.abs(turn[turn != 0]))), 3)
+    lower = "turn rate and speed" if command.speed else "turn rate"
+    return f"turning at more than {greatest:g} rad/s alone is too fast; give it a lower {lower}"
 
 
 def motors_of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]:
     """The motor of each wheel. ConfigError: there are not as many motors as wheels."""
     motors = [motor] * wheels if isinstance(motor, Motor) else list(motor)
     if len(motors) != wheels:
-        raise ConfigError(
-            f"{plural(len(motors), 'motor')} for {plural(wheels, 'wheel')}; give one for each, or one for all"
-        )
+        raise ConfigError(f"{plural(len(motors), 'motor')} for {plural(wheels, 'wheel')}; give each one, or all one")
     return motors
 
 

@@ -289,9 +289,7 @@ class SimulationRequest:
         from_config[f"CONFIG {self.config}"] = self.config
         if self.like is None and self.model is None:
             if self.config is None:
-                raise ConfigError(
-                    "name a CONFIG with a simulated data set, or a recording with --like DATASET --model CALIBRATION"
-                )
+                raise ConfigError("name a CONFIG with a simulated data set, or --like DATASET --model CALIBRATION")
             why = "is for --like; a config has its own noise and seeds"
             _refuse({"--noise": self.noise or None, "--seed": self.seed}, why)
         elif self.like is None:
