@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -159,6 +159,75 @@ Per = Literal["run", "second", "metre"]
 """Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
 
 
+@dataclass(frozen=True, eq=False)
+class CandidateRun:
+    """A command that a design may choose, with runs of it: those recorded, or one at the design values."""
+
+    name: str
+    runs: tuple[Trajectory, ...]
+
+    @property
+    def duration(self) -> float:
+        """The mean duration of the command's runs, s."""
+        return float(np.mean([run.pose_times[-1] for run in self.runs]))
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatePool:
+    """Candidates, noise and baseline of a design.
+
+    sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
+    designs are compared with. recorded: the candidates' wheel logs are recordings; else rates are as designed.
+    """
+
+    source: str
+    name: str
+    robot: Robot
+    integration: Integration
+    baseline_name: str
+    noise: Noise
+    noise_source: str
+    description: str = ""
+    notes: tuple[str, ...] = ()
+    candidates: tuple[CandidateRun, ...] = ()
+    sets: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    baseline: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    simulated: bool = True
+    recorded: bool = False
+
+    def commanded(
+        self,
+        periods: tuple[float, float],
+        sets: Mapping[str, Sequence[TimedCommand]],
+        driven: Mapping[TimedCommand, int],
+    ) -> CandidatePool:
+        """The pool with candidates of sets of commands, each with the one run of a robot that is exactly as designed.
+
+        periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
+        ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
+        """
+        place = self.source
+        if _noiseless(self.noise):
+            raise ConfigError(f"{place}: noise: give position and heading some; without it, runs cannot be weighed")
+        commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
+        places = {timed: index for index, timed in enumerate(commands)}
+        model = OdometryModel.of_design(self.robot, self.integration)
+        names = Counter(timed.command.name for timed in commands)
+        candidates = []
+        for timed in commands:
+            title = timed.command.name
+            title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
+            candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
+        indices = {of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()}
+        for of_set, chosen in indices.items():
+            if len(chosen) == 1:
+                raise ConfigError(f"{place}: {of_set}: it has one command only; a design needs several to choose from")
+            runs = [run for index in chosen for run in candidates[index].runs]
+            require_every_motion(self.robot, runs, f"{place}: {of_set}", ConfigError)
+        baseline = np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp)
+        return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
+
+
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = motion.Shapes((0.5, 1.0), (0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
@@ -279,14 +348,11 @@ class RobotCommands(Model):
         words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
         if not robot.drive.direct:
             words.append(f"steering angles {math.degrees(limit):g} deg")
-        return commanded_pool(
+        pool = CandidatePool(
             source,
             robot.name or "robot",
             robot,
             integration,
-            (_SAMPLE_PERIOD, _POSE_PERIOD),
-            {_SET: commands},
-            driven=dict.fromkeys(commands, 1),
             baseline_name=f"all {plural(len(commands), 'command')} once",
             noise=noise,
             noise_source=(
@@ -301,6 +367,7 @@ class RobotCommands(Model):
                 "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
             ),
         )
+        return pool.commanded((_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands}, dict.fromkeys(commands, 1))
 
     @property
     def _straight_rates(self) -> list[float]:
@@ -323,43 +390,6 @@ class RobotCommands(Model):
         """Sides, m, of the area that the robot's centre may be in."""
         wide, deep = (side - 2 * self._half_width for side in self.area)
         return wide, deep
-
-
-@dataclass(frozen=True, eq=False)
-class CandidateRun:
-    """A command that a design may choose, with runs of it: those recorded, or one at the design values."""
-
-    name: str
-    runs: tuple[Trajectory, ...]
-
-    @property
-    def duration(self) -> float:
-        """The mean duration of the command's runs, s."""
-        return float(np.mean([run.pose_times[-1] for run in self.runs]))
-
-
-@dataclass(frozen=True, eq=False)
-class CandidatePool:
-    """Candidates, noise and baseline of a design.
-
-    sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
-    designs are compared with. recorded: the candidates' wheel logs are recordings; else rates are as designed.
-    """
-
-    source: str
-    name: str
-    description: str
-    robot: Robot
-    integration: Integration
-    candidates: tuple[CandidateRun, ...]
-    sets: Mapping[str, tuple[int, ...]]
-    baseline: Counts
-    baseline_name: str
-    noise: Noise
-    noise_source: str
-    simulated: bool
-    recorded: bool
-    notes: tuple[str, ...]
 
 
 def read_candidates(
@@ -444,20 +474,19 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
     """
     commands = {name: config.commands(name) for name in config.sets}
     baseline, count = config.baseline, len(commands[config.baseline.set])
-    return commanded_pool(
+    pool = CandidatePool(
         source or f"config {config.name}",
         config.name,
         config.robot,
         config.integration,
-        (config.sample_period, config.pose_period),
-        commands,
-        driven=dict.fromkeys(commands[baseline.set], baseline.repetitions),
         baseline_name=f"{count} {noun_for(count, 'command')} of {baseline.set} x {baseline.repetitions}",
         noise=config.noise,
         noise_source="assumed: as the config says",
         description=config.description,
         notes=config.notes,
     )
+    driven = dict.fromkeys(commands[baseline.set], baseline.repetitions)
+    return pool.commanded((config.sample_period, config.pose_period), commands, driven)
 
 
 def _candidates_of_comparison(
@@ -484,73 +513,17 @@ def _candidates_of_comparison(
     times = {*driven.values()}
     often = f" x {times.pop()}" if len(times) == 1 else f", {plural(driven.total(), 'run')}"
     scale = flower.train.noise_scale
-    return commanded_pool(
+    pool = CandidatePool(
         place,
         name,
         flower.robot,
         chosen,
-        (flower.sample_period, flower.pose_period),
-        {name: tuple(driven)},
-        driven=driven,
         baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {name}{often}",
         noise=Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
         noise_source="assumed: what the config simulates for training",
         notes=config.notes,
     )
-
-
-def commanded_pool(
-    source: str,
-    name: str,
-    robot: Robot,
-    integration: Integration,
-    periods: tuple[float, float],
-    sets: Mapping[str, Sequence[TimedCommand]],
-    *,
-    driven: Mapping[TimedCommand, int],
-    baseline_name: str,
-    noise: Noise,
-    noise_source: str,
-    description: str = "",
-    notes: tuple[str, ...] = (),
-) -> CandidatePool:
-    """The candidates of sets of commands, each with the one run of a robot that is exactly as designed.
-
-    periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
-    ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
-    """
-    if _noiseless(noise):
-        raise ConfigError(f"{source}: noise: give position and heading some noise; without it, runs cannot be weighed")
-    commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
-    places = {timed: index for index, timed in enumerate(commands)}
-    model = OdometryModel.of_design(robot, integration)
-    names = Counter(timed.command.name for timed in commands)
-    candidates = {}
-    for timed in commands:
-        title = timed.command.name
-        title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
-        candidates[timed] = CandidateRun(title, (run_as_designed(model, timed, periods, title),))
-    for of_set, listed in sets.items():
-        if len(listed) == 1:
-            raise ConfigError(f"{source}: {of_set}: it has one command only; a design needs several to choose from")
-        runs = [run for timed in listed for run in candidates[timed].runs]
-        require_every_motion(robot, runs, f"{source}: {of_set}", ConfigError)
-    return CandidatePool(
-        source=source,
-        name=name,
-        description=description,
-        robot=robot,
-        integration=integration,
-        candidates=tuple(candidates.values()),
-        sets={of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()},
-        baseline=np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp),
-        baseline_name=baseline_name,
-        noise=noise,
-        noise_source=noise_source,
-        simulated=True,
-        recorded=False,
-        notes=notes,
-    )
+    return pool.commanded((flower.sample_period, flower.pose_period), {name: tuple(driven)}, driven)
 
 
 def _noiseless(noise: Noise) -> bool:

@@ -183,10 +183,8 @@ class Experiment(Model, Generic[S]):
     @property
     def sessions(self) -> dict[Split, S]:
         """The sessions by the split that they are for."""
-        sessions: dict[Split, S] = {"train": self.train}
-        if self.validation is not None:
-            sessions["validation"] = self.validation
-        return sessions
+        validation: dict[Split, S] = {} if self.validation is None else {"validation": self.validation}
+        return {"train": self.train, **validation}
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,11 @@ def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses
     (M,), interpolated linearly, constant outside. times (S,): times of the scans' first rays, s.
     """
     mount = scanner.mount
-    arrays = (np.ascontiguousarray(array, dtype=float) for array in (segments, track_times, track_poses, times))
-    return _cast(*arrays, scanner.delays, scanner.bearings, float(mount.x), float(mount.y))
+    segments, track_times, track_poses, times = (
+        np.ascontiguousarray(array, dtype=float) for array in (segments, track_times, track_poses, times)
+    )
+    x, y = float(mount.x), float(mount.y)
+    return _cast(segments, track_times, track_poses, times, scanner.delays, scanner.bearings, x, y)
 
 
 @compiled

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.commands import Command, wheels_of
 
@@ -199,11 +198,7 @@ def command_motion(
     The planner knows how far the set point has come. It refreshes the command until the distance is covered, also when
     commands are lost; the validity of the last command makes the robot come to rest there. A link that stalls leaves
     the run incomplete. A rest of ``settle``, s, follows.
-
-    ConfigError: the command does not move the robot.
     """
-    if not command.speed and not command.turn_rate:
-        raise ConfigError(f"command {command.name} does not move the robot; give it a speed or a rate of turn")
     seconds = way / command.speed if way is not None and command.speed else turn_duration
     set_point, sent, stops = _planned(seconds, SetPoint(profile.limits(command)), link, rng)
     samples = max(1, math.ceil((set_point.phases[-1].start + settle) / sample_period - 1e-9))
