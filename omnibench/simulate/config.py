@@ -342,15 +342,7 @@ class RobotConfig(Experiment[RobotSession]):
                 f"encoder.ticks: one tick a sample is {coarse:.3g} rad/s, and the motor's fastest rate {fastest:.3g} "
                 "rad/s, so that it cannot be controlled; give it more ticks a turn"
             )
-        if self._angles() > _MOST_ANGLES:
-            raise ValueError(
-                f"this is {self._angles():.1g} milliseconds of wheels, more than {_MOST_ANGLES:.0e}; check the "
-                "distances (m), speeds (m/s), accelerations, settle and repetitions"
-            )
-        return self
-
-    def _angles(self) -> float:
-        """Approximate number of true wheel angles that are simulated."""
+        # True wheel angles that are simulated, about.
         sessions, seconds = self.sessions.values(), 0.0
         for command in self.driven:
             limits = self.profile.limits(command)
@@ -359,4 +351,10 @@ class RobotConfig(Experiment[RobotSession]):
                 rest += 180 / self.steering.rate_deg
             for session in sessions:
                 seconds += rest + (session.distance / command.speed if command.speed else self.commands.turn_duration)
-        return seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP
+        angles = seconds * self.repetitions * len(self.robot.wheels) / TRUE_STEP
+        if angles > _MOST_ANGLES:
+            raise ValueError(
+                f"this is {angles:.1g} milliseconds of wheels, more than {_MOST_ANGLES:.0e}; check the "
+                "distances (m), speeds (m/s), accelerations, settle and repetitions"
+            )
+        return self

@@ -85,11 +85,6 @@ def trial_values(effect: contract.Effect, robot: Robot, seed: int = 0) -> Iterat
         yield {item.name: chosen[item.name] if item.choices else free[item.name] for item in parameters}
 
 
-def trials(effect: contract.Effect) -> Iterator[tuple[Robot, contract.Values]]:
-    """Every trial robot with its trial parameters."""
-    return ((robot, values) for robot in robots(effect) for values in trial_values(effect, robot))
-
-
 def without(effect: contract.Effect, robot: Robot, values: contract.Values) -> contract.Values:
     """The values with every parameter that has no choices set to 0, at which the effect changes nothing."""
     shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}
@@ -162,6 +157,13 @@ class EffectConformance(Conformance):
 
     registry = effects
 
+    def trials(self) -> Iterator[tuple[Any, Robot, contract.Values, Input]]:
+        """The effect on every trial robot, with its trial parameters and its input."""
+        effect = self.make()
+        for robot in robots(effect):
+            for values in trial_values(effect, robot):
+                yield effect, robot, values, trial_input(effect, robot)
+
     def test_physics_and_source_are_given(self) -> None:
         """Reports print them beside the name."""
         effect = self.make()
@@ -221,8 +223,7 @@ class EffectConformance(Conformance):
 
     def test_shapes_are_those_of_the_contract(self) -> None:
         """Results have the right shape for one sample and many, three wheels and four."""
-        effect = self.make()
-        for (robot, values), samples in product(trials(effect), (1, SAMPLES)):
+        for (effect, robot, values, _), samples in product(self.trials(), (1, SAMPLES)):
             inputs = trial_input(effect, robot, samples=samples)
             for name, result in results(effect, inputs, values).items():
                 shape, expected = np.shape(result), _shape(name, effect.stage, inputs, robot)
@@ -230,9 +231,7 @@ class EffectConformance(Conformance):
 
     def test_zero_parameters_change_nothing(self) -> None:
         """An effect whose parameters are 0 changes nothing."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, robot, values, inputs in self.trials():
             largest = float(np.abs(changes(effect, inputs, without(effect, robot, values))).max())
             require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
 
@@ -246,8 +245,7 @@ class EffectConformance(Conformance):
 
     def test_results_are_finite(self) -> None:
         """Results are finite while the robot drives, drives fast and stands."""
-        effect = self.make()
-        for (robot, values), speed in product(trials(effect), (0.0, 1.0, 20.0)):
+        for (effect, robot, values, _), speed in product(self.trials(), (0.0, 1.0, 20.0)):
             finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
             require(finite, f"a result is not finite where the robot {'drives' if speed else 'stands'}")
 
@@ -271,9 +269,7 @@ class EffectConformance(Conformance):
 
     def test_inputs_are_left_unchanged(self) -> None:
         """Signals, poses and values are not overwritten."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, _, values, inputs in self.trials():
             before, values_before = {name: array.copy() for name, array in arrays(inputs).items()}, dict(values)
             results(effect, inputs, values)
             same = all(np.array_equal(array, before[name]) for name, array in arrays(inputs).items())
@@ -281,9 +277,7 @@ class EffectConformance(Conformance):
 
     def test_each_sample_is_corrected_by_itself(self) -> None:
         """A sample is corrected the same alone, as in a stream, and in a batch."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, _, values, inputs in self.trials():
             if not isinstance(inputs, Signals) and len(inputs) == 2:
                 raise SkipTest("only for effects that act in a stream")
             together = changes(effect, inputs, values)
@@ -294,8 +288,7 @@ class EffectConformance(Conformance):
 
     def test_results_are_reproducible(self) -> None:
         """Results are equal in every call and instance, and no global random generator is used."""
-        for robot, values in trials(self.make()):
-            inputs = trial_input(self.make(), robot)
+        for _, _, values, inputs in self.trials():
             repeated = []
             for seed in (1, 2):
                 with global_random_state(seed):
@@ -313,7 +306,7 @@ class EffectConformance(Conformance):
             raise SkipTest("only for effects of motion")
         unused = _OPTIONAL - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
-        for robot, values in trials(effect):
+        for _, robot, values, _ in self.trials():
             try:
                 results(effect, replace(driven_signals(robot), **bare), values)
             except (TypeError, AttributeError) as error:
@@ -326,7 +319,7 @@ class EffectConformance(Conformance):
         if not isinstance(effect, contract.ReferenceEffect):
             raise SkipTest("only for effects of the reference")
         poses = trial_poses()
-        for _, values in trials(effect):
+        for _, _, values, _ in self.trials():
             back = effect.corrected(effect.reported(poses, poses[0], values), poses[0], values)
             error = float(np.abs(back - poses).max())
             require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
@@ -336,7 +329,7 @@ class EffectConformance(Conformance):
         effect = self.make()
         if not isinstance(effect, contract.ActuatorEffect):
             raise SkipTest("only for effects of the motors")
-        for robot, values in trials(effect):
+        for _, robot, values, _ in self.trials():
             targets = driven_signals(robot).rates
             durations = np.full(SAMPLES, PERIOD)
             early = effect.driven(durations[:50], targets[:50], values)
