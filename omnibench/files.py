@@ -163,7 +163,7 @@ def results_locked(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise DataError(
-                f"{folder}: another omnibench is writing results there; name another folder, or wait"
+                f"{folder}: another omnibench is writing results there; name another folder (--output), or wait for it"
             ) from None
         except OSError:
             pass  # a file system without locks

@@ -419,10 +419,8 @@ class CalibratorConformance(Conformance):
 
 def _require_honest_end(attempt: Attempt) -> None:
     # A wrapped library may ask for a few more costs until its stop takes effect; only the claim is checked.
-    require(
-        attempt.result.outcome is not Outcome.CONVERGED or not attempt.problem.refusals,
-        "it swallowed BudgetSpent and claims to have converged; let that exception through",
-    )
+    claims = attempt.result.outcome is Outcome.CONVERGED and attempt.problem.refusals
+    require(not claims, "it swallowed BudgetSpent and claims to have converged; let that exception through")
 
 
 def _contents(problem: CalibrationProblem) -> dict[str, bytes]:
