@@ -56,7 +56,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.robot.stored_odometry import odometry_of
-from omnibench.simulate.robot_config import RobotConfig
+from omnibench.simulate.config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 
