@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -43,6 +44,21 @@ def end_with_parent() -> None:
         if os.getpgrp() == os.getpid():
             os.killpg(0, signal.SIGKILL)  # with all processes that it started
         os._exit(1)
+
+
+@contextmanager
+def interrupts_not_in_callbacks() -> Iterator[None]:
+    """Within it JAX's callback of the garbage collector is off: for a process that waits for others.
+
+    CVXPY imports JAX where it is there. What is raised in such a callback is printed and forgotten, Ctrl-C among it.
+    """
+    callbacks = [callback for callback in gc.callbacks if getattr(callback, "__name__", "") == "_xla_gc_callback"]
+    for callback in callbacks:
+        gc.callbacks.remove(callback)
+    try:
+        yield
+    finally:
+        gc.callbacks.extend(callbacks)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from omnibench.errors import DataError, Interrupted
 from omnibench.fit.calibrator import Outcome, RunResult, Timing, describe_error, run_calibrator
 from omnibench.fit.problem import make_problem
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
+from omnibench.processes import interrupts_not_in_callbacks
 from omnibench.progress import Progress, Reporter
 from omnibench.registry import calibrators
 from omnibench.words import plural
@@ -36,7 +37,8 @@ def execute(
     KeyboardInterrupt passes through after the running processes are ended; what had ended is in the store.
     """
     runs = _Runs(plan, store, report)
-    run_jobs(map(_job, plan), store, backend, runs)
+    with interrupts_not_in_callbacks():
+        run_jobs(map(_job, plan), store, backend, runs)
     return [runs.results[number] for number in range(len(plan))]
 
 
