@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -67,17 +67,32 @@ class Topic:
         return otherwise if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
 
 
-Clock = Callable[[Topic, Stamps], Array]
-"""Gives times, s by the clock of the wheels, to the stamps of a topic's messages."""
-Record = tuple[int, int, Any]
-"""A recorded message: its number in its topic, from 1, the time of recording, ns, and itself, None if undecodable."""
+@dataclass(frozen=True, eq=False)
+class WheelClock:
+    """The clock of the wheels' messages: stamps (F,) and times of recording (F,), ns; the first stamp is t = 0."""
+
+    topic: str
+    stamps: Stamps
+    logged: Stamps
+
+    def seconds(self, stamps: Stamps) -> Array:
+        """Times, s since the first message; exact to the nanosecond, which a double of unix time is not."""
+        return np.asarray((stamps - self.stamps[0]) / SECOND)
 
 
 class Bag:
-    """An open bag; see :func:`open_bag`. recorded: names of topics of which the times of recording count."""
+    """An open bag; see :func:`open_bag`.
 
-    def __init__(self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path]) -> None:
-        self.path, self.definitions, self._reader = path, definitions, reader
+    recorded: names of topics of which the times of recording count. clock: of the wheels, once these are read. notes:
+    what was left out of its messages.
+    """
+
+    clock: WheelClock
+
+    def __init__(
+        self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: list[str]
+    ) -> None:
+        self.path, self.definitions, self.notes, self._reader = path, definitions, notes, reader
         self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for connection in reader.connections:
             kind = connection.msgtype
@@ -102,10 +117,14 @@ class Bag:
             raise DataError(f"{self.path}: {key}: topic {chosen.name} has no messages; record it, or name another one")
         return chosen
 
-    def records(self, topic: Topic, first: int | None = None, last: int | None = None) -> Iterator[Record]:
+    def records(
+        self, topic: Topic, first: int | None = None, last: int | None = None
+    ) -> Iterator[tuple[int, int, Any]]:
         """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
 
-        first, last: times of recording, ns, between which messages are read; numbers count from the first of these.
+        Each is given with its number in its topic, from 1, and the time of recording, ns, and is None if it cannot be
+        decoded. first, last: times of recording, ns, between which messages are read; numbers count from the first of
+        these.
         """
         number, stop = 0, None if last is None else last + 1
         with _damage_as_error(self.path):
@@ -117,10 +136,34 @@ class Bag:
                     message = None
                 yield number, logged, message
         if first is None and number < topic.messages:  # an MCAP without its message indexes
+            found = f"only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found"
+            raise DataError(f"{self.path}: {found}; its index is damaged; {_repair(self.path)}")
+
+    def seconds(self, topic: Topic, stamps: Stamps) -> Array:
+        """Times of a topic's messages, s, by the wheels' clock. DataError: no two are within the wheels' recording."""
+        clock = self.clock
+        if ((stamps >= clock.stamps[0]) & (stamps <= clock.stamps[-1])).sum() < 2:
+            spans = [f"{span[0] / SECOND:.3f} to {span[-1] / SECOND:.3f} s" for span in (stamps, clock.stamps)]
             raise DataError(
-                f"{self.path}: only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found; "
-                f"its index is damaged; {_repair(self.path)}"
+                f"{self.path}: no two messages of {topic.name} while the wheels were recorded, by the stamps of their "
+                f"headers ({topic.name} {spans[0]}, {clock.topic} {spans[1]}); both must be stamped by one clock, or "
+                f"set recorded_stamps=[{clock.topic},{topic.name}] to take the times of recording"
             )
+        return clock.seconds(stamps)
+
+    def timed(self, topic: Topic) -> list[tuple[float, Any]]:
+        """Times, s, by the wheels' clock, and messages of a topic, in this order.
+
+        A time is that of a header, or by when the message was recorded, as the wheels' messages have both.
+        """
+        order = np.argsort(self.clock.logged, kind="stable")
+        logged, wheels = self.clock.logged[order], np.maximum.accumulate(self.clock.stamps[order])
+        records = list(self.records(topic))
+        stamps = np.array([topic.stamp(message, 0) for _, _, message in records], dtype=np.int64)
+        recorded = np.array([when for _, when, _ in records], dtype=np.int64)
+        by_recording = np.interp(recorded - logged[0], logged - logged[0], self.clock.seconds(wheels))
+        times = np.where(stamps != 0, self.clock.seconds(stamps), by_recording)
+        return [(float(times[row]), records[row][2]) for row in np.argsort(times, kind="stable")]
 
     def fields(self, kind: str, before: str = "") -> dict[str, str]:
         """Types of the numbers and messages within a type by their paths; of arrays the first element's."""
@@ -143,27 +186,72 @@ class Bag:
         """ConfigError: the messages of a topic do not have the fields that the option ``key`` names."""
         fields, place = self.fields(topic.type), f"{self.path}: {key}: {topic.name} ({topic.type})"
         if topic.type not in self._reader.typestore.fielddefs:
-            way = "say what is in them by .msg files, or the folder of their package: --set message_definitions=FOLDER"
+            way = "give .msg files, or the folder of their package: --set message_definitions=FOLDER"
             raise ConfigError(f"{place}: the bag does not define its messages; {way}")
         for path in paths:
             if re.sub(r"\.\d+", ".0", path) not in fields:
                 numbers = ", ".join(self.numbers(topic)) or "none"
                 raise ConfigError(f"{place} has no field {path!r}; {nearest(path, fields)}its numbers: {numbers}")
 
+    def transforms(self, topic: Topic) -> Iterator[tuple[str, str, Any]]:
+        """Frame, parent and transform from the frame to its parent, of all messages of a topic."""
+        for _, _, message in self.records(topic):
+            for each in getattr(message, "transforms", ()):
+                yield each.child_frame_id.strip("/"), each.header.frame_id.strip("/"), each.transform
+
+    def fixed_transforms(self) -> dict[str, tuple[str, Array]]:
+        """Parent of every frame of /tf_static, and the transform (4, 4) from the frame to its parent."""
+        from scipy.spatial.transform import RigidTransform, Rotation  # slow, and needed by bags with transforms alone
+
+        parents: dict[str, tuple[str, Array]] = {}
+        for topic in self.of_type(TRANSFORMS):
+            for child, parent, transform in self.transforms(topic) if topic.name.endswith("tf_static") else ():
+                turn, place = transform.rotation, transform.translation
+                try:
+                    rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+                except ValueError:  # all zeros: no rotation, and so no transform
+                    continue
+                matrix = RigidTransform.from_components([place.x, place.y, place.z], rotation).as_matrix()
+                if np.isfinite(matrix).all():
+                    parents[child] = parent, matrix
+        return parents
+
+
+def way_up(frame: str, parents: Mapping[str, str], ends: Callable[[str], bool]) -> list[str] | None:
+    """Frames from one up to below the first that ``ends`` the way; None if none does."""
+    links: list[str] = []
+    while not ends(frame):
+        if frame not in parents or frame in links:
+            return None
+        links.append(frame)
+        frame = parents[frame]
+    return links
+
 
 @contextmanager
-def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Path] = ()) -> Iterator[Bag]:
+def open_bag(
+    path: Path, notes: list[str], recorded: Sequence[str] = (), definitions: Sequence[Path] = ()
+) -> Iterator[Bag]:
     """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged.
 
-    recorded: as for ``Bag``. definitions: files or folders of .msg files, of types that the bag does not define.
+    notes, recorded: as for ``Bag``. definitions: files or folders of .msg files, of types that the bag does not define.
     """
     # Imported here, since they load slowly and `omnibench list` does without.
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     # Bags before ROS 2 Iron do not hold the definitions of their types; those of ROS itself hardly ever changed.
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.fielddefs |= _defined_types(definitions)
+    store, given = get_typestore(Stores.ROS2_HUMBLE), dict[str, Any]()
+    for place in definitions:
+        for file in sorted(place.rglob("*.msg")) if place.is_dir() else [place]:
+            # PACKAGE/msg/NAME.msg or PACKAGE/NAME.msg
+            folder, text = file.resolve().parent, read_text(file)
+            package = folder.parent.name if folder.name == "msg" else folder.name
+            try:
+                given |= get_types_from_msg(text, f"{package}/msg/{file.stem}")
+            except Exception as error:  # of rosbags' parser
+                raise DataError(f"{file}: cannot be read as the definition of a message: {error}") from None
+    store.fielddefs |= given
     with _damage_as_error(path):
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
             if file.name == _METADATA:
@@ -172,29 +260,12 @@ def open_bag(path: Path, recorded: Sequence[str] = (), definitions: Sequence[Pat
                 check_file(file)
         reader = AnyReader([path], default_typestore=store)
         reader.open()
-        if definitions:
-            read = reader.typestore.fielddefs
-            reader.typestore.register({name: fields for name, fields in store.fielddefs.items() if name not in read})
+        read = reader.typestore.fielddefs
+        reader.typestore.register({name: fields for name, fields in given.items() if name not in read})
     try:
-        yield Bag(path, reader, recorded, definitions)
+        yield Bag(path, reader, recorded, definitions, notes)
     finally:
         reader.close()
-
-
-def _defined_types(places: Sequence[Path]) -> dict[str, Any]:
-    """The types that .msg files define: PACKAGE/msg/NAME.msg or PACKAGE/NAME.msg. DataError names a file."""
-    from rosbags.typesys import get_types_from_msg
-
-    types: dict[str, Any] = {}
-    for place in places:
-        for file in sorted(place.rglob("*.msg")) if place.is_dir() else [place]:
-            folder, text = file.resolve().parent, read_text(file)
-            package = folder.parent.name if folder.name == "msg" else folder.name
-            try:
-                types |= get_types_from_msg(text, f"{package}/msg/{file.stem}")
-            except Exception as error:  # of rosbags' parser
-                raise DataError(f"{file}: cannot be read as the definition of a message: {error}") from None
-    return types
 
 
 def find_bags(source: Path) -> dict[str, Path]:
@@ -282,21 +353,19 @@ class TopicMessages:
         self.keep(~orientations.flawed, f"with a wrong orientation{flaw}")
         return orientations.headings
 
-    def in_order(self, notes: list[str], way_out: str = "") -> NDArray[np.intp]:
+    def in_order(self, way_out: str = "") -> NDArray[np.intp]:
         """Indices of the messages that remain, sorted by stamp, without repeated stamps.
 
-        ``notes`` tell what is left out. DataError: the clock was set back, more messages were dropped than remain, or
-        fewer than two remain. way_out: what to do where these have stamps.
+        The bag's notes tell what is left out. DataError: the clock was set back, more messages were dropped than
+        remain, or fewer than two remain. way_out: what to do where these have stamps.
         """
         stamps = self.stamps[self.rows]
         behind = np.maximum.accumulate(stamps) - stamps
         if (behind > SECOND).sum() > _MOST_SET_BACK:
             first = int(np.argmax(behind > SECOND))
-            raise DataError(
-                f"{self.place}, message {self.numbers[self.rows[first]]}: the stamps go back by "
-                f"{behind[first] / SECOND:.3g} s and stay behind: the clock was set back, or two recordings share the "
-                "bag; split it there"
-            )
+            back = f"the stamps go back by {behind[first] / SECOND:.3g} s and stay behind"
+            why = "the clock was set back, or two recordings share the bag; split it there"
+            raise DataError(f"{self.place}, message {self.numbers[self.rows[first]]}: {back}: {why}")
         self.rows = self.rows[np.argsort(stamps, kind="stable")]
         fresh = np.zeros(len(self.contents), dtype=bool)
         fresh[self.rows] = np.diff(self.stamps[self.rows], prepend=-1) > 0
@@ -306,17 +375,16 @@ class TopicMessages:
         words = [f"{count} of {total} left out: {', '.join(reasons)}"] if count else []
         if len(self.rows) < max(2, count):
             if _NO_STAMP in self._left_out:
-                topics = [topic.name for topic in self._bag.topics if topic.recorded or topic == self._topic]
-                way_out = (
-                    f"set recorded_stamps=[{','.join(topics)}] to take the times of recording, or record it anew: the "
-                    "publisher must fill header.stamp"
-                )
+                topics = ",".join(each.name for each in self._bag.topics if each.recorded or each == self._topic)
+                anew = "record it anew: the publisher must fill header.stamp"
+                way_out = f"set recorded_stamps=[{topics}] to take the times of recording, or {anew}"
             problem = words[0] if count else f"it has {total}, too few"
             raise DataError(f"{self.place}: {problem}{'; ' if way_out else ''}{way_out}")
         if self._headless:
             words.append("its messages have no stamps; they have the times of recording")
         if late := int(np.count_nonzero(behind)):
             words.append(f"{plural(late, 'message')} recorded late, and sorted by stamp")
+        notes = self._bag.notes
         notes += [note for note in (f"{self.place}: {word}" for word in words) if note not in notes]
         return self.rows
 

@@ -20,7 +20,7 @@ km at d = 9 km.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -32,21 +32,20 @@ from omnibench.config import Positive, validate
 from omnibench.data.aligned import WheelSamples, measured_as
 from omnibench.data.importers.bag_messages import (
     FIX,
-    TRANSFORMS,
     Bag,
-    Clock,
     Topic,
     TopicMessages,
     open_bag,
     possible,
     reader_of,
+    way_up,
 )
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.runs import find_rests
 from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.data.splits import Names
-from omnibench.errors import ConfigError, DataError, nearest
+from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 
 _FASTEST = 100.0  # rad/s; no robot turns faster
@@ -111,8 +110,8 @@ class SensorReadings:
     sigmas: Array
 
 
-def read_sensor(bag: Bag, topic: Topic, options: SensorOptions, seconds: Clock, notes: list[str]) -> SensorReadings:
-    """The readings of a topic; what is left out is added to ``notes``. DataError: how exact they are is not known."""
+def read_sensor(bag: Bag, topic: Topic, options: SensorOptions) -> SensorReadings:
+    """The readings of a topic. DataError: how exact they are is not known."""
     fields = _FIX if topic.type == FIX else _IMU
     messages = TopicMessages(bag, topic, reader_of(fields))
     table = messages.table(len(fields))
@@ -132,16 +131,15 @@ def read_sensor(bag: Bag, topic: Topic, options: SensorOptions, seconds: Clock, 
     variances = np.full_like(variances, sigma**2) if sigma else variances
     exact: NDArray[np.bool_] = np.asarray((np.isfinite(variances) & (variances > 0)).all(axis=1))
     if len(messages.rows) and not exact[messages.rows].any():
-        what = f"its {kind}s have no covariance; say how exact they are, a standard deviation in {way}"
-        raise DataError(f"{messages.place}: {what}")
+        raise DataError(f"{messages.place}: its {kind}s have no covariance; say their standard deviation in {way}")
     messages.keep(exact, f"without a covariance (set {option})")
-    rows = messages.in_order(notes)
+    rows = messages.in_order()
     values, sigmas = values[rows], np.sqrt(variances[rows])
     if kind == "position":
         altitude, (latitude, longitude) = float(table[rows[0], 3]), values[0].tolist()
         height = altitude if abs(altitude) < _HIGHEST else 0.0
         values = east_north(values[:, 0], values[:, 1], (latitude, longitude), height)
-    times = seconds(topic, messages.stamps[rows])
+    times = bag.seconds(topic, messages.stamps[rows])
     times = times + (options.pose_time_offset + options.pose_time_drift * (times - times[0]))
     return SensorReadings(kind, times, values, sigmas)
 
@@ -164,20 +162,18 @@ class BagSensors:
         readings, offsets = [], [0.0]
         for sensor in self.readings:
             if sensor.kind == "turn":
-                within = [(sensor.times >= begin) & (sensor.times <= end) for begin, end in rests]
-                resting = np.any(within, axis=0) if rests else np.zeros(len(sensor.times), dtype=bool)
+                resting = np.zeros(len(sensor.times), dtype=bool)
+                for begin, end in rests:
+                    resting |= (sensor.times >= begin) & (sensor.times <= end)
+                offset = math.radians(self.options.gyro_offset_deg or 0.0)
                 if resting.any():
                     rested = float(resting.sum() * np.median(np.diff(sensor.times)))
-                    offsets.append(math.radians(self.options.gyro_noise_deg) / math.sqrt(rested))
+                    offset = math.radians(self.options.gyro_noise_deg) / math.sqrt(rested)
                     sensor = replace(sensor, values=sensor.values - sensor.values[resting].mean())
-                elif self.options.gyro_offset_deg is None:
-                    raise DataError(
-                        f"{place}: the robot never rests, so that nothing tells the gyro's offset; let it stand for "
-                        "some seconds, or say how large the offset may be, a standard deviation in deg/s: "
-                        "--set gyro_offset_deg=0.5"
-                    )
-                else:
-                    offsets.append(math.radians(self.options.gyro_offset_deg))
+                elif not offset:
+                    way = "let it stand some seconds, or give a standard deviation (deg/s), --set gyro_offset_deg=0.5"
+                    raise DataError(f"{place}: the robot never rests, so that nothing tells the gyro's offset; {way}")
+                offsets.append(offset)
             readings.append(sensor)
         return replace(self, readings=readings, rate_sigma=max(offsets))
 
@@ -224,85 +220,23 @@ class BagSensors:
 _BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
 _LARGEST_TILT = math.radians(20)  # rad; a scanner with a larger tilt does not scan parallel to the floor (chosen)
 _SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
-Parents = dict[str, tuple[str, Array]]
 
 
-def _transforms(bag: Bag, topic: Topic) -> Iterator[tuple[str, str, Any]]:
-    """Frame, parent and transform from the frame to its parent, of all messages of a topic."""
-    for _, _, message in bag.records(topic):
-        for each in getattr(message, "transforms", ()):
-            yield each.child_frame_id.strip("/"), each.header.frame_id.strip("/"), each.transform
-
-
-def fixed_transforms(bag: Bag) -> Parents:
-    """Parent of every frame of /tf_static, and the transform (4, 4) from the frame to its parent."""
-    from scipy.spatial.transform import RigidTransform, Rotation  # slow, and needed by bags with transforms alone
-
-    parents: Parents = {}
-    for topic in bag.of_type(TRANSFORMS):
-        for child, parent, transform in _transforms(bag, topic) if topic.name.endswith("tf_static") else ():
-            turn, place = transform.rotation, transform.translation
-            try:
-                rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
-            except ValueError:  # all zeros: no rotation, and so no transform
-                continue
-            matrix = RigidTransform.from_components([place.x, place.y, place.z], rotation).as_matrix()
-            if np.isfinite(matrix).all():
-                parents[child] = parent, matrix
-    return parents
-
-
-def _way_up(frame: str, parents: Mapping[str, str], ends: Callable[[str], bool]) -> list[str] | None:
-    """Frames from one up to below the first that ``ends`` the way; None if none does."""
-    links: list[str] = []
-    while not ends(frame):
-        if frame not in parents or frame in links:
-            return None
-        links.append(frame)
-        frame = parents[frame]
-    return links
-
-
-def frames_between(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[list[str], Parents]:
-    """The frames from the second of two to the first, which transforms of a topic or fixed ones place; and the fixed.
-
-    ConfigError: no frames are given, nothing leads from one to the other, or nothing moves on the way.
-    """
-    fixed = fixed_transforms(bag)
-    parents = {child: parent for child, parent, _ in _transforms(bag, topic)}
-    parents |= {child: parent for child, (parent, _) in fixed.items()}
-    found = f"found: {', '.join(f'{parent} > {child}' for child, parent in parents.items()) or 'none'}"
-    place = f"{bag.path}: topic {topic.name}"
-    if not frames:
-        raise ConfigError(f"{place}: set pose_frames=[world, robot] to the frames of the reference; {found}")
-    world, child = (frame.strip("/") for frame in frames)
-    links = _way_up(child, parents, lambda frame: frame == world)
-    if links is None:
-        known = {*parents, *parents.values()}
-        hint = nearest(child, known) if child not in known else ""
-        raise ConfigError(f"{place}: pose_frames: no transforms lead from {world} to {frames[1]}; {hint}{found}")
-    if fixed.keys() >= set(links):
-        raise ConfigError(f"{place}: pose_frames: {frames[1]} does not move in {world}; {found}")
-    return links, fixed
-
-
-def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, notes: list[str]) -> ScanReadings:
-    """Check every scan of a topic; what is left out is added to ``notes``. DataError, or ConfigError: it is no scanner.
+def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
+    """Check every scan of a topic. DataError, or ConfigError: it is no scanner.
 
     mount: of the scanner; None: by /tf_static. The stamp of a scan is that of its first ray.
     """
-    messages = TopicMessages(bag, topic, _laser_scan)
+    messages, notes = TopicMessages(bag, topic, _laser_scan), bag.notes
     place, scans = messages.place, messages.contents
     shape = scans[0][0] if scans else ScanShape(0, 0, 0, 0, 0)
     for number, (other, *_) in zip(messages.numbers, scans, strict=True):
         if difference := scan_difference(shape, other):
-            raise DataError(
-                f"{place}, message {number}: {difference} as in the messages before; all scans must be of one scanner, "
-                "of one number of rays"
-            )
+            alike = "all scans must be of one scanner, of one number of rays"
+            raise DataError(f"{place}, message {number}: {difference} as in the messages before; {alike}")
     empty = f"without a range from {shape.range_min:g} to {shape.range_max:g} m"
     messages.keep(np.array([seen for _, seen, *_ in scans], dtype=bool), empty)
-    rows = messages.in_order(notes)
+    rows = messages.in_order()
     _, _, frame, _, scan_time = scans[0]
     # The scanner's time between rays, s: the median of its scans.
     increments = np.array([increment for _, _, _, increment, _ in scans])
@@ -313,7 +247,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, note
     if increment == 0 and scan_time > 0:
         instant = "time_increment is 0, so that each scan counts as taken at one instant"
         notes.append(f"{place}: {instant}, though scan_time is {scan_time:.3g} s")
-    mount, sense = (mount, 1) if mount else _mounting(bag, frame, place, notes)
+    mount, sense = (mount, 1) if mount else _mounting(bag, frame, place)
     angles = {"angle_min": sense * shape.angle_min, "angle_increment": sense * shape.angle_increment}
     content = {"name": topic.name, "time_increment": increment, "mount": mount, **shape._asdict(), **angles}
     scanner = validate(Scanner, content, place)
@@ -324,7 +258,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, note
         keys = zip(logged[chosen].tolist(), stamps[chosen].tolist(), strict=True)
         places = {key: index for index, key in enumerate(keys)}
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
-        with open_bag(bag.path, [topic.name] if topic.recorded else [], bag.definitions) as again:
+        with open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
             first, last = int(logged[chosen].min()), int(logged[chosen].max())
             for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
                 index = places.pop((when, topic.stamp(message, when)), None)
@@ -334,7 +268,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None, seconds: Clock, note
             raise DataError(f"{place}: the bag has changed since it was opened; import it again")
         return ranges
 
-    return ScanReadings(scanner, place, seconds(topic, stamps), read)
+    return ScanReadings(scanner, place, bag.seconds(topic, stamps), read)
 
 
 def _laser_scan(message: Any) -> tuple[ScanShape, bool, str, float, float]:
@@ -355,27 +289,24 @@ def _measured(message: Any) -> Ranges:
     return np.where(good, ranges, np.float32(np.inf))
 
 
-def _mounting(bag: Bag, frame: str, place: str, notes: list[str]) -> tuple[Mount, int]:
+def _mounting(bag: Bag, frame: str, place: str) -> tuple[Mount, int]:
     """The mount of a scanner by /tf_static, or the robot's middle; and -1 if it hangs upside down, else 1.
 
     Counter-clockwise rays of one that hangs upside down run clockwise in the robot's frame. DataError: it is tilted.
     """
-    fixed, whole = fixed_transforms(bag), np.eye(4)
+    fixed, whole = bag.fixed_transforms(), np.eye(4)
     parents = {child: parent for child, (parent, _) in fixed.items()}
-    links = _way_up(frame.strip("/"), parents, lambda child: child.rpartition("/")[2] in _BASES)
+    links = way_up(frame.strip("/"), parents, lambda child: child.rpartition("/")[2] in _BASES)
     if links is None:
-        notes.append(
-            f"{place}: it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted (no /tf_static "
-            "from base_link); the robot's middle is taken; --set 'scanner_mount={x: 0.1, y: 0, yaw: 0}' (m, rad)"
-        )
+        unknown = f"it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted"
+        way = "--set 'scanner_mount={x: 0.1, y: 0, yaw: 0}' (m, rad)"
+        bag.notes.append(f"{place}: {unknown} (no /tf_static from base_link); the robot's middle is taken; {way}")
         return Mount(), 1
     for link in links:
         whole = fixed[link][1] @ whole
     tilt = math.acos(np.clip(whole[2, 2], -1.0, 1.0))
     if min(tilt, math.pi - tilt) > _LARGEST_TILT:
-        raise DataError(
-            f"{bag.path}: the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does "
-            "not scan the plane of the floor; if it does, set scanner_mount"
-        )
+        tilted = f"the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does not scan"
+        raise DataError(f"{bag.path}: {tilted} the plane of the floor; if it does, set scanner_mount")
     yaw = math.atan2(whole[1, 0], whole[0, 0])
     return Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), -1 if tilt > math.pi / 2 else 1
