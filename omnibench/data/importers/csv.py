@@ -74,6 +74,7 @@ def _as_separator(value: str) -> str:
     return value
 
 
+Separator = Annotated[str, AfterValidator(_as_separator)]
 Column = Annotated[str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)]
 """An option that takes the name of a column, or its number."""
 
@@ -85,29 +86,19 @@ class CsvOptions(ReferenceOptions):
 
     name: str = Field("csv", min_length=1, description="name of the data set")
     columns: dict[str, Column] = Field(
-        {}, description="names of columns, as {t: time, omega_left: rpm_l, x: px}; also pose_t, run, z, qx, qy, qz, qw"
+        {}, description="as {t: time, omega_left: rpm_l, x: px}; pose_t, run, z, qx ... qw"
     )
     wheel_columns: Names = Field((), description="in the robot's order; default omega_, phi_ or ticks_ <wheel>")
     wheel_time_column: Column | None = Field(None, description=f"default: {', '.join(TIMES)}")
     steering_columns: Names = Field((), description="in the order of the wheels that steer; default steer_<wheel>")
-    pose_columns: Names = Field(
-        (), description="of x, y and heading; default: x, y, and theta, heading, yaw, or qx..qw"
-    )
+    pose_columns: Names = Field((), description="x, y, heading; default: x, y, and theta, heading, yaw, or qx..qw")
     pose_time_column: Column | None = Field(None, description="default: as for wheels")
     up: Literal["x", "y", "z"] = Field("z", description="axis of the poses that points up: y of motion capture")
-    run_column: Column | None = Field(
-        None, description=f"it names the run of a row; default, if any: {', '.join(RUNS)}"
-    )
-    runs_table: Path | None = Field(
-        None, description="table of run, command, repetition, split, session; default: runs.csv, if any"
-    )
-    separator: Annotated[str, AfterValidator(_as_separator)] | None = Field(
-        None, min_length=1, description="comma, semicolon, tab, blanks or a character; default: recognised"
-    )
+    run_column: Column | None = Field(None, description=f"names the run of a row; default, if any: {', '.join(RUNS)}")
+    runs_table: Path | None = Field(None, description="of run, command, repetition, split, session; default: runs.csv")
+    separator: Separator | None = Field(None, description="comma, semicolon, tab, blanks or a character; default: auto")
     decimal: Literal["point", "comma"] = Field("point", description="what decimals are written with")
-    header_lines: int = Field(
-        1, ge=0, description="lines above the rows, the last with the names; 0: columns by number, from 1"
-    )
+    header_lines: int = Field(1, ge=0, description="above the rows, the last with names; 0: columns by number, from 1")
     pose_header_lines: int | None = Field(None, ge=0, description="of the poses' files, if they are others")
     wheel_suffix: str | None = Field(None, min_length=1, description="of the wheels' files; default _wheels.csv")
     pose_suffix: str | None = Field(None, min_length=1, description="of the poses' files; default _poses.csv or .tum")

@@ -34,7 +34,6 @@ from omnibench.data.importers.bag_messages import (
     way_up,
 )
 from omnibench.data.importers.bag_sensors import BagSensors, SensorOptions, read_scans, read_sensor
-from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.recording import (
     Event,
     PoseReadings,
@@ -48,6 +47,7 @@ from omnibench.data.recording import (
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
+from omnibench.data.spoiled_references import follows_the_wheels
 from omnibench.errors import ConfigError, DataError, nearest, one_line
 from omnibench.registry import importers
 from omnibench.robot.joint_choice import JointChoice

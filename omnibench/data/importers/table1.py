@@ -106,19 +106,19 @@ class Table1(Importer):
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
         """The trajectories under ``source`` as they stand in their tables."""
+        options = self.options
         folders = [file.parent for file in sorted(source.rglob("command.csv"))]
         if not folders:
-            what = "no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
-            raise DataError(f"{source}: {what}")
-        recordings = [_recording(folder, source, self.options) for folder in folders]
-        if self.options.scanner == UTM_30LX and any(recording.scans for recording in recordings):
+            raise DataError(f"{source}: no command.csv below it; each trajectory is a folder with one")
+        recordings = [_recording(folder, source, options) for folder in folders]
+        if options.scanner == UTM_30LX and any(recording.scans for recording in recordings):
             unknown = "lidar.csv does not say where the LIDAR is mounted; the robot's middle is taken"
             notes.append(f"{source}: {unknown}; {_WAY_OUT}")
         # Splits by folders called train and validation, else every second repetition validates.
         attributes = [recording.attributes for recording in recordings]
         alike = [(said.session, said.command) for said in attributes]
         splits: list[Split | None] = [said.split for said in attributes]
-        if not any(splits) or self.options.train or self.options.validation:
+        if not any(splits) or options.train or options.validation:
             splits = list(every_second(alike))
         if None in splits:
             stray = recordings[splits.index(None)].name
@@ -134,8 +134,7 @@ def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
     wheels, targets = ([f"omega_{prefix}{wheel}" for wheel in options.robot.wheel_names] for prefix in ("", "M"))
     table = read_numbers(folder / "command.csv", _COMMAND)
     if len(table) != 1:
-        rows = plural(len(table), "row")
-        raise DataError(f"{table.file}: it has {rows}, expected one: the command of this trajectory")
+        raise DataError(f"{table.file}: it has {plural(len(table), 'row')}, expected one: the trajectory's command")
     v, alpha, omega, distance = table.columns(_COMMAND)[0].tolist()
     times, rates = _timed(folder / "wheels.csv", wheels)
     pose_times, poses = _timed(folder / "slam.csv", _POSE)
