@@ -30,16 +30,8 @@ from pydantic import Field
 
 from omnibench.config import Positive, validate
 from omnibench.data.aligned import WheelSamples, measured_as
-from omnibench.data.importers.bag_messages import (
-    FIX,
-    Bag,
-    Topic,
-    TopicMessages,
-    open_bag,
-    possible,
-    reader_of,
-    way_up,
-)
+from omnibench.data.importers import bag_messages as bags
+from omnibench.data.importers.bag_messages import Bag, Topic, TopicMessages
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.runs import find_rests
@@ -112,18 +104,18 @@ class SensorReadings:
 
 def read_sensor(bag: Bag, topic: Topic, options: SensorOptions) -> SensorReadings:
     """The readings of a topic. DataError: how exact they are is not known."""
-    fields = _FIX if topic.type == FIX else _IMU
-    messages = TopicMessages(bag, topic, reader_of(fields))
+    fields = _FIX if topic.type == bags.FIX else _IMU
+    messages = TopicMessages(bag, topic, bags.reader_of(fields))
     table = messages.table(len(fields))
-    kind: ReferenceKind = "position" if topic.type == FIX else "heading"
+    kind: ReferenceKind = "position" if topic.type == bags.FIX else "heading"
     option, sigma, way = "fix_sigma", options.fix_sigma, "m: --set fix_sigma=1.5"
     if kind == "position":
         messages.keep(table[:, 0] >= 0, "without a fix (status -1)")
-        messages.keep(possible(table[:, 1:3] / (90, 360), _ON_EARTH), "without latitude and longitude")
+        messages.keep(bags.possible(table[:, 1:3] / (90, 360), _ON_EARTH), "without latitude and longitude")
         values, variances = table[:, 1:3], np.where(table[:, 4:5] == _UNKNOWN, np.nan, table[:, 5:])
     elif options.imu == "gyro" or not len(table) or (table[:, 5] == -1).any():
         kind, values, variances = "turn", table[:, 4:5], np.ones((len(table), 1))
-        messages.keep(possible(values, _FASTEST), "without a rate of turn")
+        messages.keep(bags.possible(values, _FASTEST), "without a rate of turn")
     else:
         option, sigma = "heading_sigma_deg", options.heading_sigma_deg and math.radians(options.heading_sigma_deg)
         way = "degrees: --set heading_sigma_deg=2, or take its rates of turn: --set imu=gyro"
@@ -258,7 +250,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
         keys = zip(logged[chosen].tolist(), stamps[chosen].tolist(), strict=True)
         places = {key: index for index, key in enumerate(keys)}
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
-        with open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
+        with bags.open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
             first, last = int(logged[chosen].min()), int(logged[chosen].max())
             for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
                 index = places.pop((when, topic.stamp(message, when)), None)
@@ -296,7 +288,7 @@ def _mounting(bag: Bag, frame: str, place: str) -> tuple[Mount, int]:
     """
     fixed, whole = bag.fixed_transforms(), np.eye(4)
     parents = {child: parent for child, (parent, _) in fixed.items()}
-    links = way_up(frame.strip("/"), parents, lambda child: child.rpartition("/")[2] in _BASES)
+    links = bags.way_up(frame.strip("/"), parents, lambda child: child.rpartition("/")[2] in _BASES)
     if links is None:
         unknown = f"it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted"
         way = "--set 'scanner_mount={x: 0.1, y: 0, yaw: 0}' (m, rad)"

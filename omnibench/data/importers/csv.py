@@ -21,18 +21,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from omnibench.config import as_yaml
+from omnibench.data import delimited
 from omnibench.data.dataset import SPLITS, Dataset
-from omnibench.data.delimited import (
-    AUTO,
-    DECIMAL_COMMA,
-    LARGE,
-    ColumnError,
-    NoRowsError,
-    Table,
-    missing_column,
-    not_increasing,
-    read_cells,
-)
+from omnibench.data.delimited import ColumnError, Table, missing_column
 from omnibench.data.importer import Importer
 from omnibench.data.importers.tum import planar_headings, read_tum
 from omnibench.data.recording import PoseReadings, Recording, ReferenceOptions, RunAttributes, WheelReadings, words_of
@@ -332,7 +323,7 @@ def _way_out(table: Table, missing: Sequence[str], options: CsvOptions) -> str:
     settings = [
         *unit_options(taken | {key: found[key] for key in (time,) if key in found}, table, options, shared=shared)
     ]
-    if any(DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name)[:100]):
+    if any(delimited.DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name)[:100]):
         settings.append("decimal=comma")
     if not joints.isdisjoint(taken.values()):
         settings = list(dict.fromkeys([*settings, "wheel_unit=rad", "wheel_time_unit=ns"]))
@@ -432,9 +423,11 @@ def load(file: Path, options: CsvOptions, *, poses: bool = False) -> Table:
     """The table of a file as the options say it is written. poses: it holds the poses alone."""
     other = options.pose_header_lines if poses else None
     lines = options.header_lines if other is None else other
-    separator = None if options.separator == BLANKS else options.separator or AUTO
+    separator = None if options.separator == BLANKS else options.separator or delimited.AUTO
     try:
-        table = read_cells(file, separator=separator, header_lines=lines, decimal_comma=options.decimal == "comma")
+        table = delimited.read_cells(
+            file, separator=separator, header_lines=lines, decimal_comma=options.decimal == "comma"
+        )
     except DataError as error:
         if not poses or "--set header_lines" not in str(error):
             raise
@@ -478,7 +471,7 @@ def _by_headers(
     for file in tables:
         try:
             table = load(file, options)
-        except NoRowsError:
+        except delimited.NoRowsError:
             notes.append(f"{file}: left out, as it has no rows")
             continue
         name = file.relative_to(source).with_suffix("").as_posix()
@@ -574,7 +567,7 @@ def _values(stream: Stream, table: Table, notes: list[str]) -> tuple[Array, Arra
             repeated = plural(int(again.sum()), "row")
             notes.append(f"{table.file}: {repeated} that repeat the {time} of the one before left out")
     times = numbers[:, 0].copy()
-    if (flaw := not_increasing(times)) is not None:
+    if (flaw := delimited.not_increasing(times)) is not None:
         raise DataError(f"{table.fail(int(rows[flaw[0]]), f'{time} {flaw[1]}')}{_of_runs(table.only(rows), time)}")
     return times, numbers[:, 1:].copy(), tuple(names), rows
 
@@ -629,7 +622,7 @@ def _recordings(
     runs = list(dict.fromkeys([*wheels, *poses]))
     if len(runs) > 1:
         runs = [run for run in runs if run is not None]
-        if files.wheels.stat().st_size > LARGE:
+        if files.wheels.stat().st_size > delimited.LARGE:
             expect_reading(len(runs), "run")
     reference = files.poses or files.references or files.wheels
     for run in runs:
@@ -776,7 +769,7 @@ class Csv(Importer):
         names, users = list[str](), Counter[Path | None]()  # of the recordings, and of tables of references
 
         def read() -> Iterator[Recording]:
-            if size > LARGE:
+            if size > delimited.LARGE:
                 expect_reading(len(files), "run")
             for each in files:
                 of_runs = measured[each.references] if each.references else {}
@@ -789,7 +782,7 @@ class Csv(Importer):
         size = sum(
             file.stat().st_size for file in {file for each in files for file in (each.wheels, each.poses) if file}
         )
-        recordings = Scratch().sequence(read()) if size > LARGE else list(read())
+        recordings = Scratch().sequence(read()) if size > delimited.LARGE else list(read())
         for file, of_runs in measured.items():
             if None in of_runs and users[file] > 1:
                 found = ", ".join(of_runs[None].names)

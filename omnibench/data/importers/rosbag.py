@@ -16,23 +16,8 @@ from pydantic import Field, model_validator
 from omnibench.config import Positive
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
-from omnibench.data.importers.bag_messages import (
-    FIX,
-    IMU,
-    SCAN,
-    SECOND,
-    TRANSFORMS,
-    Bag,
-    Stamps,
-    Topic,
-    TopicMessages,
-    WheelClock,
-    find_bags,
-    open_bag,
-    possible,
-    reader_of,
-    way_up,
-)
+from omnibench.data.importers import bag_messages as bags
+from omnibench.data.importers.bag_messages import Bag, Stamps, Topic, TopicMessages
 from omnibench.data.importers.bag_sensors import BagSensors, SensorOptions, read_scans, read_sensor
 from omnibench.data.recording import (
     Event,
@@ -177,7 +162,7 @@ def pose_topics(bag: Bag, options: RosbagOptions, wheels: Topic, *, others: bool
     Odometry and transforms are never taken unasked: a calibration against the robot's own odometry would find nothing
     wrong. Empty: there is none, but there are ``others``, scans or sensors.
     """
-    types = (*POSE_TYPES, ODOMETRY, TRANSFORMS)
+    types = (*POSE_TYPES, ODOMETRY, bags.TRANSFORMS)
     if options.pose_topic is not None and options.pose_columns:
         topic = bag.topic(options.pose_topic, "pose_topic")
         bag.require_fields(topic, options.pose_columns, "pose_columns")
@@ -227,7 +212,7 @@ def _listed(topics: Sequence[Topic]) -> str:
 
 def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
     """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
-    with open_bag(path, notes, options.recorded_stamps, [*map(Path, options.message_definitions)]) as bag:
+    with bags.open_bag(path, notes, options.recorded_stamps, [*map(Path, options.message_definitions)]) as bag:
         topics = wheel_topics(bag, options)
         steering: list[Topic] = []
         if options.robot.drive.steered:
@@ -236,14 +221,14 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
                 raise ConfigError(f"{path}: every wheel has its own topic; --set steering_topic=[...], too")
         scans: list[Topic] = []
         if options.scans:
-            scans = _named(bag, "scan_topic", [options.scan_topic] if options.scan_topic else [], (SCAN,))
-            scans = scans or _only(bag, "scan_topic", bag.of_type(SCAN), "/scan", topics[0])
-        others = bool(scans or options.references or bag.of_type(FIX, IMU))
+            scans = _named(bag, "scan_topic", [options.scan_topic] if options.scan_topic else [], (bags.SCAN,))
+            scans = scans or _only(bag, "scan_topic", bag.of_type(bags.SCAN), "/scan", topics[0])
+        others = bool(scans or options.references or bag.of_type(bags.FIX, bags.IMU))
         references = pose_topics(bag, options, topics[0], others=others)
         # Sensors count where they are named, or where nothing else tells how the robot moved.
-        sensors = _named(bag, "references", options.references, (FIX, IMU))
+        sensors = _named(bag, "references", options.references, (bags.FIX, bags.IMU))
         if not (references or scans or sensors):
-            sensors = [topic for kind in (FIX, IMU) for topic in _only(bag, "references", bag.of_type(kind))]
+            sensors = [topic for kind in (bags.FIX, bags.IMU) for topic in _only(bag, "references", bag.of_type(kind))]
         twists = [topic for topic in bag.of_type(*_TWISTS) if topic.name.endswith("cmd_vel")]
         beside = [topic for topic in twists if topic.namespace == topics[0].namespace]
         sent = next((each[0] for each in (twists, beside) if len(each) == 1), None)
@@ -280,14 +265,14 @@ class _Joints:
     @property
     def longest_gap(self) -> float:
         """The longest time, s, between messages of a robot that drives."""
-        return max(_LONGEST_GAP, _LONGEST_GAP_PERIODS * float(np.median(np.diff(self.stamps))) / SECOND)
+        return max(_LONGEST_GAP, _LONGEST_GAP_PERIODS * float(np.median(np.diff(self.stamps))) / bags.SECOND)
 
     def covers(self, stamps: Stamps) -> NDArray[np.bool_]:
         """True for stamps (F,) at which there is a message, or one before and one after without a gap."""
         after, last = np.searchsorted(self.stamps, stamps), len(self.stamps) - 1
         before = np.searchsorted(self.stamps, stamps, side="right") - 1
         spans = self.stamps[np.minimum(after, last)] - self.stamps[before]
-        return np.asarray((before >= 0) & (after <= last) & (spans <= self.longest_gap * SECOND))
+        return np.asarray((before >= 0) & (after <= last) & (spans <= self.longest_gap * bags.SECOND))
 
 
 def read_wheels(bag: Bag, wheels: Sequence[Topic], steering: Sequence[Topic], options: RosbagOptions) -> WheelReadings:
@@ -314,7 +299,7 @@ def read_wheels(bag: Bag, wheels: Sequence[Topic], steering: Sequence[Topic], op
         shown = ", ".join(topic.name for topic in dict.fromkeys((*wheels, *steering)))
         way = "all must be stamped by one clock, or be named in recorded_stamps"
         raise DataError(f"{bag.path}: topics {shown} hold no messages of one time; {way}")
-    bag.clock = WheelClock(wheels[0].name, first.stamps[covered], first.logged[covered])
+    bag.clock = bags.WheelClock(wheels[0].name, first.stamps[covered], first.logged[covered])
     times, values, read_at = bag.clock.seconds(bag.clock.stamps), [], []
     for stream in turning + steered:
         stamps, numbers = bag.clock.seconds(stream.stamps), stream.values
@@ -342,7 +327,7 @@ def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOpti
             way = wheels_typed(bag, choice.wheels, [topic])
             raise ConfigError(f"{bag.path}: {role}_topic: {topic.name} is {topic.type}, expected {JOINT_STATE}{way}")
         bag.require_fields(topic, paths, key)
-        fields, choice = reader_of(paths), replace(choice, asked=())
+        fields, choice = bags.reader_of(paths), replace(choice, asked=())
     places: dict[tuple[str, ...], tuple[int, ...] | None] = {}
 
     def read(message: Any) -> Array | None:
@@ -364,7 +349,7 @@ def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOpti
         raise choice.not_found(messages.place, joints)
     count = len(choice.wheels)
     positions, velocities = messages.table(2 * count).reshape(-1, 2, count).swapaxes(0, 1)
-    counted, measured = possible(positions, _LARGEST_COUNT), possible(velocities, _LARGEST_COUNT)
+    counted, measured = bags.possible(positions, _LARGEST_COUNT), bags.possible(velocities, _LARGEST_COUNT)
     take_positions = quantity == "increments" or (quantity == "positions" and use == "positions")
     if quantity == "positions" and use == "auto":
         # Positions that tell what velocities do, and are not zeros that a driver fills in.
@@ -383,11 +368,11 @@ def read_joints(bag: Bag, topic: Topic, choice: JointChoice, options: RosbagOpti
 def read_poses(bag: Bag, topic: Topic, options: RosbagOptions) -> PoseReadings:
     """The poses of a topic. DataError, ConfigError."""
     covariances, columns = None, options.pose_columns
-    if topic.type == TRANSFORMS and not columns:
+    if topic.type == bags.TRANSFORMS and not columns:
         stamps, poses = _by_transforms(bag, topic, options.pose_frames)
     else:
         paths = list(columns) if len(columns) == 3 else _pose_paths(bag, topic, columns)
-        messages = TopicMessages(bag, topic, reader_of(paths))
+        messages = TopicMessages(bag, topic, bags.reader_of(paths))
         table = messages.table(len(paths))
         rows, poses = _planar(messages, table[:, :6])
         stamps = messages.stamps[rows]
@@ -428,9 +413,9 @@ def _pose_parts(kind: str, path: str) -> list[str]:
 
 def _planar(messages: TopicMessages, table: Array) -> tuple[NDArray[np.intp], Array]:
     """Rows of x, y and heading (K, 3), or of x, y and a quaternion (K, 6), on the floor, and their poses (n, 3)."""
-    messages.keep(possible(table[:, :2]), "without a finite position")
+    messages.keep(bags.possible(table[:, :2]), "without a finite position")
     headings = messages.keep_planar(table[:, 2:]) if table.shape[1] > 3 else table[:, 2]
-    messages.keep(possible(headings[:, None]), "without a finite heading")
+    messages.keep(bags.possible(headings[:, None]), "without a finite heading")
     rows = messages.in_order()
     return rows, np.column_stack([table[:, :2], headings])[rows]
 
@@ -448,14 +433,14 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[Stamp
     if not frames:
         raise ConfigError(f"{place}: set pose_frames=[world, robot] to the frames of the reference; {found}")
     world, child = (frame.strip("/") for frame in frames)
-    links = way_up(child, parents, lambda frame: frame == world)
+    links = bags.way_up(child, parents, lambda frame: frame == world)
     if links is None:
         known = {*parents, *parents.values()}
         hint = nearest(child, known) if child not in known else ""
         raise ConfigError(f"{place}: pose_frames: no transforms lead from {world} to {frames[1]}; {hint}{found}")
     if fixed.keys() >= set(links):
         raise ConfigError(f"{place}: pose_frames: {frames[1]} does not move in {world}; {found}")
-    read, streams = reader_of(_pose_parts("geometry_msgs/msg/Transform", "transform")), {}
+    read, streams = bags.reader_of(_pose_parts("geometry_msgs/msg/Transform", "transform")), {}
     for link in [link for link in links if link not in fixed]:
 
         def placed(message: Any, link: str = link) -> list[Any]:
@@ -471,7 +456,7 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[Stamp
     for link in reversed(links):
         if link in streams:
             times, poses = streams[link]
-            step = interpolated((stamps - times[0]) / SECOND, (times - times[0]) / SECOND, poses)
+            step = interpolated((stamps - times[0]) / bags.SECOND, (times - times[0]) / bags.SECOND, poses)
         else:
             matrix = fixed[link][1]
             step = np.broadcast_to([*matrix[:2, 3], np.arctan2(matrix[1, 0], matrix[0, 0])], whole.shape)
@@ -488,7 +473,7 @@ def _events(bag: Bag, topic: Topic) -> tuple[Event, ...]:
 
 def _sent_twists(bag: Bag, topic: Topic) -> Array | None:
     """The twists that were sent (C, 5), each valid until another one came; None without any."""
-    read = reader_of(("linear.x", "linear.y", "angular.z"))
+    read = bags.reader_of(("linear.x", "linear.y", "angular.z"))
     messages = [(time, message) for time, message in bag.timed(topic) if message]
     table = np.array([(time, *read(getattr(message, "twist", message))) for time, message in messages]).reshape(-1, 4)
     times, x, y, turn = table[np.isfinite(table).all(axis=1)].T
@@ -563,7 +548,7 @@ class Rosbag(Importer):
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
         """The bags at or below ``source`` as they were recorded."""
-        recordings = [read_bag(path, name, self.options, notes) for name, path in find_bags(source).items()]
+        recordings = [read_bag(path, name, self.options, notes) for name, path in bags.find_bags(source).items()]
         bare = [recording.place for recording in recordings if not recording.referenced]
         if 0 < len(bare) < len(recordings):
             what = "no topic holds reference poses, as it does in other bags"
