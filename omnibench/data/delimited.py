@@ -190,8 +190,7 @@ class Table:
             row = int(wrong.arg_true()[0])
             hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(cells[row]) else ""
             raise self.fail(row, f"{name} is {cells[row]!r}, expected a number{hint}")
-        floats: Array = numbers.fill_null(np.nan).to_numpy()
-        return floats
+        return np.asarray(numbers.fill_null(np.nan).to_numpy())
 
     def _column(self, name: str) -> pl.Series:
         return self._selected(pl.nth(_place(self.file, name, self.names))).to_series()

@@ -98,8 +98,7 @@ def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> Jumps:
 def _misfits(odometry: Array, poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
     """By how much (n, 2), m and rad, the motions between poses differ from the odometry's."""
     off = relative(poses[first], poses[last]) - relative(odometry[first], odometry[last])
-    misfits: Array = np.column_stack([np.hypot(off[:, 0], off[:, 1]), np.abs(wrapped(off[:, 2]))])
-    return misfits
+    return np.column_stack([np.hypot(off[:, 0], off[:, 1]), np.abs(wrapped(off[:, 2]))])
 
 
 _INTERVAL = 1.0  # s

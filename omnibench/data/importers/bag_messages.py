@@ -391,5 +391,4 @@ class TopicMessages:
 
 def possible(values: Array, largest: float = LARGEST) -> NDArray[np.bool_]:
     """True for rows of values (F, n) that are finite, and smaller than anything real."""
-    small: NDArray[np.bool_] = np.abs(values) < largest
-    return np.asarray(small.all(axis=1))
+    return np.asarray((np.abs(values) < largest).all(axis=1))
