@@ -252,9 +252,7 @@ class RunsOptions(Options):
 
     group: ClassVar[str] = "Robot and runs"
 
-    robot: RobotOption = Field(
-        description="default: robot.yaml in the source or beside it; import csv --template DIR writes one"
-    )
+    robot: RobotOption = Field(description="--set robot=FILE.yaml, or robot.yaml; import csv --template DIR writes one")
     wheels: dict[str, dict[str, Any]] = Field({}, description="values in place of the file's, as {left: {y: 0.12}}")
     mount: dict[str, float] | None = Field(None, description="tracked point, {x: 0.1, y: 0} (m), yaw (rad) or yaw_deg")
     train: Names = Field((), description="patterns of run names that train")
@@ -292,9 +290,7 @@ class RecordingOptions(RunsOptions):
 
     group: ClassVar[str] = "Wheels and steering"
 
-    wheel_unit: WheelUnit = Field(
-        "rad/s", description="positions rad, m ...; rates rad/s, rpm ...; steps rad/sample ..."
-    )
+    wheel_unit: WheelUnit = Field("rad/s", description="positions rad, m ...; rates rad/s, rpm ...; or rad/sample ...")
     wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round, as [-1,1]")
     ticks_per_turn: PerWheel = Field((), description="of the wheel, gear included; with gear_ratio of the motor")
     gear_ratio: PerWheel = Field((), description="turns of the motor for one of the wheel, where it has the encoder")
@@ -322,9 +318,7 @@ class ReferenceOptions(RecordingOptions):
     pose_time_offset: FiniteFloat = Field(0.0, description="s, added to the times of the poses")
     pose_time_drift: Drift = Field(0.0, description="s per s since the first pose, added to the times of the poses")
     clocks: Literal["same", "match"] = Field("same", description="match: find offsets and drifts from wheels and poses")
-    longest_gap: Positive | None = Field(
-        None, description="s; a run is cut where wheels or poses are missing for longer"
-    )
+    longest_gap: Positive | None = Field(None, description="s; cut a run where wheels or poses are missing for longer")
     jumps: Jumps = Field("keep", description="drop lone poses that jump; cut: and end a run where the reference shifts")
     start_at_rest: bool = Field(False, description="true: a run begins where the robot last stood before it drives")
     cut: Literal["rests", "topic", "windows", "none"] = Field("none", description="where runs end and begin")
@@ -332,9 +326,7 @@ class ReferenceOptions(RecordingOptions):
     least_rest: Positive = Field(0.5, description="s; shorter rests do not cut")
     rest_rate: Positive = Field(0.05, description="rad/s; wheels that turn slower, over least_rest, rest")
     least_run: NonNegative = Field(1.0, description="s; shorter drives between rests are left out")
-    command_pattern: str | None = Field(
-        None, description="regular expression, whose group 1 in a run's name is the command"
-    )
+    command_pattern: str | None = Field(None, description="regular expression; group 1 in a run's name: the command")
 
     @model_validator(mode="after")
     def _options_fit_together(self) -> ReferenceOptions:

@@ -76,9 +76,7 @@ class CsvOptions(ReferenceOptions):
     group: ClassVar[str] = "Tables, columns and units"
 
     name: str = Field("csv", min_length=1, description="name of the data set")
-    columns: dict[str, Column] = Field(
-        {}, description="as {t: time, omega_left: rpm_l, x: px}; pose_t, run, z, qx ... qw"
-    )
+    columns: dict[str, Column] = Field({}, description="as {t: time, omega_left: rpm_l}; x, pose_t, run, z, qx ... qw")
     wheel_columns: Names = Field((), description="in the robot's order; default omega_, phi_ or ticks_ <wheel>")
     wheel_time_column: Column | None = Field(None, description=f"default: {', '.join(TIMES)}")
     steering_columns: Names = Field((), description="in the order of the wheels that steer; default steer_<wheel>")
@@ -274,10 +272,10 @@ _TURNS = frozenset(("orientation", "rotation", "quaternion", "quat", "q", "rot")
 def missing_error(table: Table, missing: Sequence[str], options: CsvOptions) -> ColumnError:
     """The error that names what is missing, by its keys, what was found, and what to type if that is meant."""
     if not table.headed:
-        return ColumnError(
-            f"{table.file}: it has no header and {len(table.names)} columns; say by numbers, from 1, which of them are "
-            f'{", ".join(missing)}: --set "columns={{{missing[0]}: 1, ...}}"'
+        way = (
+            f'say by numbers, from 1, which of them are {", ".join(missing)}: --set "columns={{{missing[0]}: 1, ...}}"'
         )
+        return ColumnError(f"{table.file}: it has no header and {len(table.names)} columns; {way}")
     names = [f"'{options.accepted[key][0]}'" for key in missing]
     what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
     if above := table.lines_above:
@@ -320,20 +318,16 @@ def _way_out(table: Table, missing: Sequence[str], options: CsvOptions) -> str:
             taken[key] = likely
     shared = any(key in missing or key in found for key in wheels[1:])
     time = wheels[0] if shared else poses[0]
-    settings = [
-        *unit_options(taken | {key: found[key] for key in (time,) if key in found}, table, options, shared=shared)
-    ]
+    named = taken | {key: found[key] for key in (time,) if key in found}
+    settings = list(unit_options(named, table, options, shared=shared))
     if any(delimited.DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name)[:100]):
         settings.append("decimal=comma")
     if not joints.isdisjoint(taken.values()):
         settings = list(dict.fromkeys([*settings, "wheel_unit=rad", "wheel_time_unit=ns"]))
     typed = "".join(f" --set {setting}" for setting in settings)
     keys = [each for key in missing for each in (QUATERNION if key == "theta" and "qw" in taken else (key,))]
-    names = {key: taken.get(key, "NAME") for key in keys}
-    quoted = {
-        key: name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'" for key, name in names.items()
-    }
-    shown = ", ".join(f"{key}: {name}" for key, name in quoted.items())
+    quoted = {name: name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'" for name in taken.values()}
+    shown = ", ".join(f"{key}: {quoted[taken[key]] if key in taken else 'NAME'}" for key in keys)
     if taken.keys() >= {*keys}:
         return f'did you mean --set "columns={{{shown}}}"{typed}?'
     way = f'name {"it" if len(keys) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
@@ -350,12 +344,10 @@ def _likely(key: str, free: Mapping[str, Sequence[str]], options: CsvOptions, be
     steers, wheel = key.startswith("steer_"), key.split("_", 1)[-1]
     words = _KINDS.get("t" if key == "pose_t" else key) or _SIDES.get(wheel.lower())
     steering = [name for name, said in free.items() if not _STEERING.isdisjoint(said)]
-    alike = [
-        name
-        for name, said in free.items()
-        if steers == (name in steering)
-        and (not set(words).isdisjoint(said) if words else set(words_of(wheel)) <= set(said))
-    ]
+    kind = [name for name in free if steers == (name in steering)]
+    alike = [name for name in kind if not set(words or ()).isdisjoint(free[name])]
+    if not words:
+        alike = [name for name in kind if set(words_of(wheel)) <= set(free[name])]
     if steers and not alike and len(options.robot.drive.steered) == 1:
         alike = steering
     alike = [name for name in alike if not beside.isdisjoint(words_of(name))] or alike
@@ -399,11 +391,9 @@ def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[Tab
         for name in sorted({*wheels, *poses, *of_one} - {pair.name for pair in pairs}):
             file = wheels.get(name) or poses.get(name) or of_one[name]
             endings, option = (pose_endings, "pose_suffix") if name in wheels else (wheel_endings, "wheel_suffix")
-            raise DataError(
-                f"{file}: run {name!r} has no {' or '.join(name + ending for ending in endings)}; --set {option}=ENDING"
-                f" for other names, name a file of both as the source, or put other references into "
-                f"{name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
-            )
+            others = f"put other references into {name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
+            way = f"--set {option}=ENDING for other names, name a file of both as the source, or {others}"
+            raise DataError(f"{file}: run {name!r} has no {' or '.join(name + end for end in endings)}; {way}")
     if pairs:
         return pairs
     if options.wheel_suffix and not alone:
@@ -489,10 +479,10 @@ def _by_headers(
         of_wheels = [table.file for table, _ in lacking if not wheels_in(table, options, shared=False).missing]
         of_poses = [table.file.name for table, _ in lacking if not poses_in(table, options, shared=False).missing]
         if of_wheels and of_poses:
-            raise DataError(
-                f"{of_wheels[0]} holds wheels and {of_poses[0]} poses; call them <run>_wheels.csv and <run>_poses.csv, "
-                "or say what their names end in: --set wheel_suffix=ENDING --set pose_suffix=ENDING"
+            way = (
+                "call them <run>_wheels.csv and <run>_poses.csv, or --set wheel_suffix=ENDING --set pose_suffix=ENDING"
             )
+            raise DataError(f"{of_wheels[0]} holds wheels and {of_poses[0]} poses; {way}")
         raise missing_error(*min(lacking, key=lambda pair: len(pair[1])), options)
     if lacking:
         others = some([table.file.relative_to(source).as_posix() for table, _ in lacking])
@@ -520,10 +510,8 @@ def read_measured(table: Table) -> References:
     A heading with t0 = 0 counts from the run's start. DataError names the row of what is wrong.
     """
     if "kind" not in table:
-        raise DataError(
-            f"{missing_column(table.file, 'kind', table.names)}; a row needs its kind ({', '.join(KINDS)}), value and "
-            "sigma (omnibench guide references)"
-        )
+        known = f"{', '.join(KINDS)} (omnibench guide references)"
+        raise DataError(f"{missing_column(table.file, 'kind', table.names)}; a row's kind is one of {known}")
     kinds = np.array([kind.lower() for kind in table.texts("kind")], dtype=str)
     numbers = {name: np.full(len(table), np.nan) for name in NUMBERS}
     numbers |= {name: table.numbers([name])[:, 0] for name in NUMBERS if name in table}
@@ -613,10 +601,8 @@ def _recordings(
             columns = ", ".join(dict.fromkeys(name for columns in said.values() for name in columns))
             typed = " ".join(f"--set {setting}" for setting in said)
             option = next(iter(said)).partition("=")[0]
-            raise ColumnError(
-                f"{stream.table.file}: columns say another unit than they are read in ({columns}): {typed}; or say "
-                f"the unit that holds, as --set {option}={getattr(options, option) or 's'}"
-            )
+            way = f"{typed}; or say the unit that holds, as --set {option}={getattr(options, option) or 's'}"
+            raise ColumnError(f"{stream.table.file}: columns say another unit than they are read in ({columns}): {way}")
     wheels = by_run(table, options)
     poses = {} if len(streams) == 1 else wheels if shared else by_run(streams[1].table, options)
     runs = list(dict.fromkeys([*wheels, *poses]))
@@ -686,9 +672,8 @@ def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> 
     unused = [key for key in (*_TEXTS, *_NUMBERS) if key not in known]
     hints = {name: nearest(name, unused).strip() for name in table.names if name not in (named, *known)}
     notes += [f"{file}: column {name!r} is not read; {hint}" for name, hint in hints.items() if hint]
-    columns: dict[str, list[Any]] = {
-        key: table.texts(key) if key in _TEXTS else table.numbers([key])[:, 0].tolist() for key in known
-    }
+    columns: dict[str, list[Any]] = {key: table.texts(key) for key in known if key in _TEXTS}
+    columns |= {key: table.numbers([key])[:, 0].tolist() for key in known if key in _NUMBERS}
     attributes: dict[str, RunAttributes] = {}
     for row, run in enumerate(table.texts(named)):
         said = {key: column[row] for key, column in columns.items()}
@@ -760,11 +745,8 @@ class Csv(Importer):
         options = self.options
         files = find_tables(source, options, notes)
         as_tables = options.model_copy(update={"header_lines": 1, "separator": None})
-        measured = {
-            file: by_run(load(file, as_tables).in_lower_case(), options)
-            for file in dict.fromkeys(each.references for each in files)
-            if file
-        }
+        of_references = filter(None, dict.fromkeys(each.references for each in files))
+        measured = {file: by_run(load(file, as_tables).in_lower_case(), options) for file in of_references}
         attributes = read_run_attributes(source, options, notes)
         names, users = list[str](), Counter[Path | None]()  # of the recordings, and of tables of references
 
@@ -779,9 +761,8 @@ class Csv(Importer):
                     users[each.references] += 1
                     yield recording
 
-        size = sum(
-            file.stat().st_size for file in {file for each in files for file in (each.wheels, each.poses) if file}
-        )
+        tables = {file for each in files for file in (each.wheels, each.poses) if file}
+        size = sum(file.stat().st_size for file in tables)
         recordings = Scratch().sequence(read()) if size > delimited.LARGE else list(read())
         for file, of_runs in measured.items():
             if None in of_runs and users[file] > 1:

@@ -35,21 +35,19 @@ from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.words import plural
 
+RobotType = Literal["diff", "omni3", "omni4", "tricyc"]
+_SOURCE = "public GitHub repository sousarbarb/optiodom, commit 8e025fd7"
 _RUN = re.compile(r"_run-(\d+)\.csv$")
 _POSE = ("t", "x", "y", "theta")
 _SAME_SPEED = 0.02  # m/s, rad/s: commands below are standstill
 _SAME_TICKS = 1e-6  # logs of turns are rounded to some digits
-_DESCRIPTION = (
-    "INESC TEC {} and OptiTrack; Sousa, Petry, Costa, Moreira: "
-    "OptiOdom, J. Intell. Robot. Syst. 105:39 (2022), doi 10.1007/s10846-022-01630-3. Encoders and OptiTrack were "
-    "synchronised by hand, run by run: offsets up to 0.2 s and a drift of about 0.1 s a minute remain."
-)
 
 
 class Kind(Model):
     """A robot, and the columns of its files; ``optiodom.yaml`` says what each means."""
 
     title: str
+    description: str
     lengths: int
     wheels: tuple[dict[str, Any], ...]
     columns: tuple[str, ...]
@@ -62,18 +60,18 @@ class Kind(Model):
     def robot(self, lengths: Sequence[float], diameters: Sequence[float], name: str) -> Robot:
         """The robot of these dimensions, m. Of a tricycle, whose metadata state one diameter, all wheels have this."""
         scales = {"x": lengths[0], "y": lengths[-1], "distance": lengths[0]}
-        wheels = [
-            {key: value * scales.get(key, 1) if key in scales else value for key, value in wheel.items()}
-            | {"radius": diameter / 2}
-            for wheel, diameter in zip(self.wheels, cycle(diameters), strict=False)
-        ]
+        wheels = []
+        for wheel, diameter in zip(self.wheels, cycle(diameters), strict=False):
+            scaled = {key: wheel[key] * scale for key, scale in scales.items() if key in wheel}
+            wheels.append({**wheel, **scaled, "radius": diameter / 2})
         return Robot.model_validate({"name": name, "wheels": wheels})
 
 
 @cache
 def kinds() -> dict[str, Kind]:
     """The robots by their type in the metadata."""
-    return {name: Kind(**content) for name, content in read_yaml(Path(__file__).with_suffix(".yaml")).items()}
+    content = read_yaml(Path(__file__).with_suffix(".yaml"))
+    return {name: Kind(**kind, description=content["description"]) for name, kind in content["robots"].items()}
 
 
 @dataclass(frozen=True)
@@ -208,17 +206,13 @@ def _path(header: Sequence[Sequence[str]]) -> str:
 class OptiodomOptions(Options):
     """Choice of groups that train and validate. A group is the folder that holds session folders: circular, square."""
 
-    robot: Literal["diff", "omni3", "omni4", "tricyc"] | None = Field(
-        None, description="the robot to import where the source holds several; its sessions' metadata say their type"
-    )
+    robot: RobotType | None = Field(None, description="the one to import where the source holds several")
     train: Names = Field((), description="groups that train; default: the first by name")
     validation: Names = Field((), description="groups that validate; default: all others")
     log: bool = Field(True, description="read commands and absolute wheel angles from each session's own log")
     name: str = Field("optiodom", min_length=1, description="name of the data set")
     robot_name: str | None = Field(None, min_length=1, description="default: inesc_tec_ and its type")
-    source: str = Field(
-        "public GitHub repository sousarbarb/optiodom, commit 8e025fd7", description="origin of the recording"
-    )
+    source: str = Field(_SOURCE, description="origin of the recording")
 
 
 @importers.register("optiodom")
@@ -270,10 +264,8 @@ class Optiodom(Importer):
         notes = []
         if others:
             rest = "; ".join(f"{said[other]} in {count}" for other, count in others)
-            notes.append(
-                f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
-                f"{said[common]} (others: {rest})"
-            )
+            taken = f"those of {most} of {len(sessions)} are taken, {said[common]} (others: {rest})"
+            notes.append(f"sessions state different dimensions of the robot: {taken}")
         runs, groups, unlogged = list[Trajectory](), list[str](), list[str]()
         for session in sessions:
             log = read_log(session) if options.log else None
@@ -281,10 +273,9 @@ class Optiodom(Importer):
             runs += [_read_run(session, number, log, options.log) for number in session.runs]
             groups += [session.group] * len(session.runs)
         if unlogged:
-            notes.append(
-                f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
-                "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
-            )
+            without = f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)})"
+            instead = "commands are named after the motion by the wheels there, and absolute wheel angles are left out"
+            notes.append(f"{without}: {instead} of all runs")
         train = options.train
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
@@ -294,7 +285,7 @@ class Optiodom(Importer):
             kind.robot(*common, options.robot_name or f"inesc_tec_{robot}"),
             usual_period([run.pose_times for run in runs]),
             divided(complete(runs), train, options.validation, "group", names=groups),
-            description=" ".join([_DESCRIPTION.format(kind.title), *sentences]),
+            description=" ".join([kind.description.format(kind.title), *sentences]),
             source=options.source,
             licence="MIT",
         )
