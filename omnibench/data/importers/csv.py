@@ -371,6 +371,9 @@ class TableFiles:
     references: Path | None = None
 
 
+PlaceOf = Callable[[str], Path | None]
+
+
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     alone = source.is_file()
@@ -444,11 +447,7 @@ def _by_ending(source: Path, files: Sequence[Path], endings: Sequence[str]) -> d
 
 
 def _by_headers(
-    source: Path,
-    tables: Sequence[Path],
-    references: Callable[[str], Path | None],
-    options: CsvOptions,
-    notes: list[str],
+    source: Path, tables: Sequence[Path], references: PlaceOf, options: CsvOptions, notes: list[str]
 ) -> list[TableFiles]:
     """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references.
 
@@ -491,6 +490,7 @@ def _by_headers(
 
 
 Tables = dict[str | None, Table]
+Attributes = dict[str, RunAttributes]
 
 
 def by_run(table: Table, options: CsvOptions) -> Tables:
@@ -572,13 +572,7 @@ def _of_runs(table: Table, time: str) -> str:
 
 
 def _recordings(
-    files: TableFiles,
-    measured: Tables,
-    attributes: Mapping[str, RunAttributes],
-    options: CsvOptions,
-    notes: list[str],
-    *,
-    several: bool,
+    files: TableFiles, measured: Tables, attributes: Attributes, options: CsvOptions, notes: list[str], *, several: bool
 ) -> Iterator[Recording]:
     """The recording of every run that a column of the tables names, or of all of their rows.
 
@@ -658,7 +652,7 @@ def _poses(stream: Stream, table: Table, options: CsvOptions, notes: list[str]) 
     return PoseReadings(times, np.column_stack([places, orientations.headings]), radians=True)
 
 
-def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> dict[str, RunAttributes]:
+def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> Attributes:
     """What a table of runs says of each run, by its name; empty without one. DataError names the row of a flaw."""
     folder = source if source.is_dir() else source.parent
     file = options.runs_table or file_called(folder, RUN_TABLES, other_than=source)
@@ -674,7 +668,7 @@ def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> 
     notes += [f"{file}: column {name!r} is not read; {hint}" for name, hint in hints.items() if hint]
     columns: dict[str, list[Any]] = {key: table.texts(key) for key in known if key in _TEXTS}
     columns |= {key: table.numbers([key])[:, 0].tolist() for key in known if key in _NUMBERS}
-    attributes: dict[str, RunAttributes] = {}
+    attributes: Attributes = {}
     for row, run in enumerate(table.texts(named)):
         said = {key: column[row] for key, column in columns.items()}
         if (split := said.get("split", SPLITS[0])) not in SPLITS:

@@ -1,7 +1,25 @@
-"""Importer of ROS recordings (MCAP files, rosbag2 folders and ROS 1 bags): its options, and which topics it reads."""
+"""Importer of ROS recordings (MCAP files, rosbag2 folders and ROS 1 bags): its options, and which topics it reads.
+
+An inertial sensor (sensor_msgs/Imu) gives headings, by its orientation where it tells one, else by its rate of turn. A
+receiver of satellites (sensor_msgs/NavSatFix) gives positions, east and north of the first fix, in the plane that
+touches the ellipsoid WGS 84 there. A point of latitude phi, longitude lambda and height h above the ellipsoid has the
+geocentric coordinates
+
+    X = (N + h) cos phi cos lambda,  Y = (N + h) cos phi sin lambda,  Z = (N (1 - e^2) + h) sin phi,       (1)
+    N = a / sqrt(1 - e^2 sin^2 phi),
+
+and east and north of an origin (phi0, lambda0) are
+
+    east  = -sin lambda0 dX + cos lambda0 dY,                                                             (2)
+    north = -sin phi0 cos lambda0 dX - sin phi0 sin lambda0 dY + cos phi0 dZ.                             (3)
+
+Source: NIMA TR8350.2, World Geodetic System 1984. The plane shortens a way at a distance d by d^2 / (2 R^2): 1 mm in a
+km at d = 9 km.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,22 +32,24 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from omnibench.config import Positive
+from omnibench.data.aligned import WheelSamples, measured_as
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
-from omnibench.data.importers import bag_messages as bags
-from omnibench.data.importers.bag_messages import Bag, Stamps, Topic, TopicMessages
-from omnibench.data.importers.bag_sensors import BagSensors, SensorOptions, read_scans, read_sensor
+from omnibench.data.importers import bags
+from omnibench.data.importers.bags import Bag, Stamps, Topic, TopicMessages
 from omnibench.data.recording import (
     Event,
     PoseReadings,
     Recording,
+    ReferenceOptions,
     RunAttributes,
     Signs,
     WheelReadings,
     WheelUnit,
     words_of,
 )
-from omnibench.data.runs import dataset_of
+from omnibench.data.references import Reference, ReferenceKind, References
+from omnibench.data.runs import dataset_of, find_rests
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.data.spoiled_references import follows_the_wheels
@@ -57,6 +77,34 @@ _POSES = {
     "geometry_msgs/msg/Transform": ("translation", "rotation"),
 }
 _COVARIANCE = [f"covariance.{6 * row + column}" for row in (0, 1, 5) for column in (0, 1, 5)]  # of x, y and yaw
+
+_FASTEST = 100.0  # rad/s; no robot turns faster
+_SEMI_MAJOR = 6378137.0  # m, a of WGS 84
+_FLATTENING = 1 / 298.257223563  # of WGS 84
+_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
+_UNKNOWN = 0  # position_covariance_type: COVARIANCE_TYPE_UNKNOWN
+_ON_EARTH = 1.0000001  # of the largest latitude and longitude
+_HIGHEST = 1e5  # m; an altitude beyond is garbage
+_FIX = ["status.status", "latitude", "longitude", "altitude", "position_covariance_type"]
+_FIX += ["position_covariance.0", "position_covariance.4"]
+_IMU = ["orientation.x", "orientation.y", "orientation.z", "orientation.w", "angular_velocity.z"]
+_IMU += ["orientation_covariance.0", "orientation_covariance.8"]  # the first is -1 where there is no orientation
+_GYRO_GAP = 0.3  # s between messages, across which no angle is counted; chosen
+_LEAST_SPAN = 0.05  # s; a turn over less tells nothing
+
+
+class SensorOptions(ReferenceOptions):
+    """Fixes of satellites and inertial sensors, and how exact they are."""
+
+    group: ClassVar[str] = "Fixes, compasses and gyros"
+
+    references: Names = Field((), description="NavSatFix, Imu; default: those there are, without poses and scans")
+    imu: Literal["auto", "gyro"] = Field("auto", description="gyro: its rates of turn; auto: its headings, if any")
+    fix_sigma: Positive | None = Field(None, description="m, standard deviation of a fix; default: its covariance's")
+    heading_sigma_deg: Positive | None = Field(None, description="deg, of an Imu's heading; default: its covariance's")
+    gyro_noise_deg: Positive = Field(0.1, description="deg per sqrt(s), by which the angle of a gyro wanders")
+    gyro_offset_deg: Positive | None = Field(None, description="deg/s, of a gyro whose robot never rests")
+    reference_period: Positive = Field(1.0, description="s; one fix, heading or turn is taken in each")
 
 
 class RosbagOptions(SensorOptions):
@@ -236,7 +284,7 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
         wheels = read_wheels(bag, topics, steering, options)
         readings = [read_sensor(bag, topic, options) for topic in sensors]
         try:
-            seen = read_scans(bag, scans[0], options.scanner_mount) if scans else None
+            seen = bags.read_scans(bag, scans[0], options.scanner_mount) if scans else None
         except (ConfigError, DataError) as error:
             raise DataError(f"{error}; scans=false leaves the scans out") from None
         return Recording(
@@ -250,6 +298,146 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
             sensors=BagSensors(readings, options) if readings else None,
             numbered=True,
         )
+
+
+def east_north(latitudes: Array, longitudes: Array, origin: tuple[float, float], height: float = 0.0) -> Array:
+    """East and north (K, 2), m, of latitudes and longitudes (K,), degrees, as seen from an origin, degrees.
+
+    height: m above the ellipsoid, of all points: the robot is on the floor.
+    """
+
+    def geocentric(phi: Array, lam: Array) -> Array:  # Eq. (1)
+        normal = _SEMI_MAJOR / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(phi) ** 2)
+        out = (normal + height) * np.cos(phi)
+        up = (normal * (1 - _ECCENTRICITY_SQUARED) + height) * np.sin(phi)
+        return np.array([out * np.cos(lam), out * np.sin(lam), up])
+
+    phi, lam = np.radians(origin)
+    start = geocentric(np.array([phi]), np.array([lam]))
+    dx, dy, dz = geocentric(np.radians(latitudes), np.radians(longitudes)) - start
+    east = -np.sin(lam) * dx + np.cos(lam) * dy  # Eq. (2)
+    north = -np.sin(phi) * (np.cos(lam) * dx + np.sin(lam) * dy) + np.cos(phi) * dz  # Eq. (3)
+    return np.column_stack([east, north])
+
+
+@dataclass(frozen=True, eq=False)
+class SensorReadings:
+    """Readings at times (K,), s, by the clock of the wheels: positions, headings, or rates of turn (kind ``turn``).
+
+    values (K, n): m east and north, rad, or rad/s. sigmas (K, n): standard deviations of positions and headings.
+    """
+
+    kind: ReferenceKind
+    times: Array
+    values: Array
+    sigmas: Array
+
+
+def read_sensor(bag: Bag, topic: Topic, options: SensorOptions) -> SensorReadings:
+    """The readings of a topic. DataError: how exact they are is not known."""
+    fields = _FIX if topic.type == bags.FIX else _IMU
+    messages = TopicMessages(bag, topic, bags.reader_of(fields))
+    table = messages.table(len(fields))
+    kind: ReferenceKind = "position" if topic.type == bags.FIX else "heading"
+    option, sigma, way = "fix_sigma", options.fix_sigma, "m: --set fix_sigma=1.5"
+    if kind == "position":
+        messages.keep(table[:, 0] >= 0, "without a fix (status -1)")
+        messages.keep(bags.possible(table[:, 1:3] / (90, 360), _ON_EARTH), "without latitude and longitude")
+        values, variances = table[:, 1:3], np.where(table[:, 4:5] == _UNKNOWN, np.nan, table[:, 5:])
+    elif options.imu == "gyro" or not len(table) or (table[:, 5] == -1).any():
+        kind, values, variances = "turn", table[:, 4:5], np.ones((len(table), 1))
+        messages.keep(bags.possible(values, _FASTEST), "without a rate of turn")
+    else:
+        option, sigma = "heading_sigma_deg", options.heading_sigma_deg and math.radians(options.heading_sigma_deg)
+        way = "degrees: --set heading_sigma_deg=2, or take its rates of turn: --set imu=gyro"
+        values, variances = messages.keep_planar(table[:, :4])[:, None], table[:, 6:]
+    variances = np.full_like(variances, sigma**2) if sigma else variances
+    exact: NDArray[np.bool_] = np.asarray((np.isfinite(variances) & (variances > 0)).all(axis=1))
+    if len(messages.rows) and not exact[messages.rows].any():
+        raise DataError(f"{messages.place}: its {kind}s have no covariance; say their standard deviation in {way}")
+    messages.keep(exact, f"without a covariance (set {option})")
+    rows = messages.in_order()
+    values, sigmas = values[rows], np.sqrt(variances[rows])
+    if kind == "position":
+        altitude, (latitude, longitude) = float(table[rows[0], 3]), values[0].tolist()
+        height = altitude if abs(altitude) < _HIGHEST else 0.0
+        values = east_north(values[:, 0], values[:, 1], (latitude, longitude), height)
+    times = bag.seconds(topic, messages.stamps[rows])
+    times = times + (options.pose_time_offset + options.pose_time_drift * (times - times[0]))
+    return SensorReadings(kind, times, values, sigmas)
+
+
+@dataclass(frozen=True, eq=False)
+class BagSensors:
+    """Fixes, headings and gyros of a recording. rate_sigma: standard deviation of the gyros' offsets, rad/s."""
+
+    readings: Sequence[SensorReadings]
+    options: SensorOptions
+    rate_sigma: float = 0.0
+
+    def without_bias(self, samples: WheelSamples, least_rest: float, still: float, place: str) -> BagSensors:
+        """The sensors with the gyros' offsets, seen while the wheels rest for ``least_rest`` s (see ``find_rests``).
+
+        White noise of a rate leaves its mean over a rest of T s unknown by the noise over sqrt(T). DataError: there is
+        no rest, and ``gyro_offset_deg`` is not given.
+        """
+        rests = [rest for part in samples.stretches() for rest in find_rests(*samples.edges(part), least_rest, still)]
+        readings, offsets = [], [0.0]
+        for sensor in self.readings:
+            if sensor.kind == "turn":
+                resting = np.zeros(len(sensor.times), dtype=bool)
+                for begin, end in rests:
+                    resting |= (sensor.times >= begin) & (sensor.times <= end)
+                offset = math.radians(self.options.gyro_offset_deg or 0.0)
+                if resting.any():
+                    rested = float(resting.sum() * np.median(np.diff(sensor.times)))
+                    offset = math.radians(self.options.gyro_noise_deg) / math.sqrt(rested)
+                    sensor = replace(sensor, values=sensor.values - sensor.values[resting].mean())
+                elif not offset:
+                    way = "let it stand some seconds, or give a standard deviation (deg/s), --set gyro_offset_deg=0.5"
+                    raise DataError(f"{place}: the robot never rests, so that nothing tells the gyro's offset; {way}")
+                offsets.append(offset)
+            readings.append(sensor)
+        return replace(self, readings=readings, rate_sigma=max(offsets))
+
+    def of_run(self, zero: float, end: float, *, start_known: bool) -> References | None:
+        """The references of a run from the time ``zero`` on, for ``end`` s; None if there are none.
+
+        start_known: its start pose is known in the frame of fixes and headings.
+        """
+        references: list[Reference] = []
+        for sensor in self.readings:
+            times = sensor.times - zero
+            if sensor.kind == "turn":
+                references += self._turns(times, sensor.values[:, 0], end)
+                continue
+            # The first reading in each period of the run.
+            inside = np.flatnonzero((times >= 0) & (times <= end))
+            _, first = np.unique(np.floor(times[inside] / self.options.reference_period), return_index=True)
+            references += [
+                Reference(sensor.kind, tuple(sensor.values[row]), tuple(sensor.sigmas[row]), float(times[row]))
+                for row in inside[first]
+            ]
+        if not references:
+            return None
+        measured = References.of(references, end, start_known=start_known, rate_sigma=self.rate_sigma)
+        return measured_as(measured, self.options.model_copy(update={"position_unit": "m", "heading_unit": "rad"}))
+
+    def _turns(self, times: Array, rates: Array, end: float) -> list[Reference]:
+        """Angles turned in each period; beside the offset's, their errors are independent: a rate's white noise."""
+        begin, last = max(0.0, float(times[0])), min(end, float(times[-1]))
+        if last - begin < _LEAST_SPAN:
+            return []
+        edges = np.linspace(begin, last, max(1, round((last - begin) / self.options.reference_period)) + 1)
+        angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
+        turned = np.diff(np.interp(edges, times, angles))
+        sigma = math.radians(self.options.gyro_noise_deg) * math.sqrt((last - begin) / len(turned))
+        gaps = np.flatnonzero(np.diff(times) > _GYRO_GAP)
+        return [
+            Reference("turn", angle, sigma, t1, t0)
+            for angle, t0, t1 in zip(turned.tolist(), edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+            if not ((times[gaps] < t1) & (times[gaps + 1] > t0)).any()
+        ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,11 @@
-"""Messages of bags (MCAP, rosbag2 and ROS 1), read with rosbags, and the values in them by field path.
+"""Messages of bags (MCAP, rosbag2 and ROS 1), read with rosbags: values by field path, transforms, and scans on demand.
 
 Every fault of a file is one line. Messages that cannot be used are left out and counted, late ones are sorted.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.config import read_yaml
+from omnibench.config import read_yaml, validate
 from omnibench.data.importers.tum import planar_headings
+from omnibench.data.recording import ScanReadings, ScanShape, scan_difference
+from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
 from omnibench.robot.kinematics import Array
@@ -38,6 +41,9 @@ _MOST_SET_BACK = 20  # messages that may come over a second late; more mean a cl
 _NO_STAMP = "without a header stamp (it is 0)"
 _SUFFIXES, _METADATA = (".mcap", ".db3", ".bag"), "metadata.yaml"
 _REPAIR = {".mcap": "`mcap recover` saves what is there", ".bag": "`rosbag reindex` saves what is there"}
+_BASES = ("base_link", "base_footprint", "base")  # REP-105; with or without the robot's namespace
+_LARGEST_TILT = math.radians(20)  # rad; a scanner with a larger tilt does not scan parallel to the floor (chosen)
+_SAME_INCREMENT = 0.1  # relative difference of the time between rays, which some drivers measure anew for every scan
 _NO_VALUES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "string", "wstring")
 
 
@@ -392,3 +398,93 @@ class TopicMessages:
 def possible(values: Array, largest: float = LARGEST) -> NDArray[np.bool_]:
     """True for rows of values (F, n) that are finite, and smaller than anything real."""
     return np.asarray((np.abs(values) < largest).all(axis=1))
+
+
+def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
+    """Check every scan of a topic. DataError, or ConfigError: it is no scanner.
+
+    mount: of the scanner; None: by /tf_static. The stamp of a scan is that of its first ray.
+    """
+    messages, notes = TopicMessages(bag, topic, _laser_scan), bag.notes
+    place, scans = messages.place, messages.contents
+    shape = scans[0][0] if scans else ScanShape(0, 0, 0, 0, 0)
+    for number, (other, *_) in zip(messages.numbers, scans, strict=True):
+        if difference := scan_difference(shape, other):
+            alike = "all scans must be of one scanner, of one number of rays"
+            raise DataError(f"{place}, message {number}: {difference} as in the messages before; {alike}")
+    empty = f"without a range from {shape.range_min:g} to {shape.range_max:g} m"
+    messages.keep(np.array([seen for _, seen, *_ in scans], dtype=bool), empty)
+    rows = messages.in_order()
+    _, _, frame, _, scan_time = scans[0]
+    # The scanner's time between rays, s: the median of its scans.
+    increments = np.array([increment for _, _, _, increment, _ in scans])
+    increment = float(np.median(increments))
+    if np.abs(increments - increment).max() > _SAME_INCREMENT * abs(increment):
+        varies = f"time_increment varies from {increments.min():.3g} to {increments.max():.3g} s"
+        notes.append(f"{place}: {varies}; its median, {increment:.3g} s, is taken")
+    if increment == 0 and scan_time > 0:
+        instant = "time_increment is 0, so that each scan counts as taken at one instant"
+        notes.append(f"{place}: {instant}, though scan_time is {scan_time:.3g} s")
+    mount, sense = (mount, 1) if mount else _mounting(bag, frame, place)
+    angles = {"angle_min": sense * shape.angle_min, "angle_increment": sense * shape.angle_increment}
+    content = {"name": topic.name, "time_increment": increment, "mount": mount, **shape._asdict(), **angles}
+    scanner = validate(Scanner, content, place)
+    stamps, logged = messages.stamps[rows], messages.logged[rows]
+
+    def read(chosen: NDArray[np.intp]) -> Ranges:
+        """The ranges of some scans. DataError: the bag has changed since it was opened."""
+        keys = zip(logged[chosen].tolist(), stamps[chosen].tolist(), strict=True)
+        places = {key: index for index, key in enumerate(keys)}
+        ranges = np.empty((len(chosen), scanner.rays), np.float32)
+        with open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
+            first, last = int(logged[chosen].min()), int(logged[chosen].max())
+            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
+                index = places.pop((when, topic.stamp(message, when)), None)
+                if index is not None and len(message.ranges) == scanner.rays:
+                    ranges[index] = _measured(message)
+        if places:
+            raise DataError(f"{place}: the bag has changed since it was opened; import it again")
+        return ranges
+
+    return ScanReadings(scanner, place, bag.seconds(topic, stamps), read)
+
+
+def _laser_scan(message: Any) -> tuple[ScanShape, bool, str, float, float]:
+    """Shape of a scan, whether any range is a measurement, its frame, time between its rays (s), its duration (s)."""
+    range_max = float(message.range_max)
+    if not np.isfinite(range_max):  # some drivers give no limit
+        range_max = float(np.finfo(np.float32).max)
+    angles = float(message.angle_min), float(message.angle_increment)
+    shape = ScanShape(len(message.ranges), *angles, float(message.range_min), range_max)
+    seen = bool(np.isfinite(_measured(message)).any())
+    return shape, seen, message.header.frame_id, float(message.time_increment), float(message.scan_time)
+
+
+def _measured(message: Any) -> Ranges:
+    """The ranges of a scan (R,), m; inf for NaN, 0 and values out of the scanner's range, which are no measurements."""
+    ranges = np.asarray(message.ranges, dtype=np.float32)
+    good = (ranges >= message.range_min) & (ranges <= message.range_max) & (ranges > 0)  # False for NaN
+    return np.where(good, ranges, np.float32(np.inf))
+
+
+def _mounting(bag: Bag, frame: str, place: str) -> tuple[Mount, int]:
+    """The mount of a scanner by /tf_static, or the robot's middle; and -1 if it hangs upside down, else 1.
+
+    Counter-clockwise rays of one that hangs upside down run clockwise in the robot's frame. DataError: it is tilted.
+    """
+    fixed, whole = bag.fixed_transforms(), np.eye(4)
+    parents = {child: parent for child, (parent, _) in fixed.items()}
+    links = way_up(frame.strip("/"), parents, lambda child: child.rpartition("/")[2] in _BASES)
+    if links is None:
+        unknown = f"it is unknown where the scanner ({frame or 'a frame without a name'}) is mounted"
+        way = "--set 'scanner_mount={x: 0.1, y: 0, yaw: 0}' (m, rad)"
+        bag.notes.append(f"{place}: {unknown} (no /tf_static from base_link); the robot's middle is taken; {way}")
+        return Mount(), 1
+    for link in links:
+        whole = fixed[link][1] @ whole
+    tilt = math.acos(np.clip(whole[2, 2], -1.0, 1.0))
+    if min(tilt, math.pi - tilt) > _LARGEST_TILT:
+        tilted = f"the scanner's frame {frame} is tilted by {math.degrees(tilt):.0f} degrees, so that it does not scan"
+        raise DataError(f"{bag.path}: {tilted} the plane of the floor; if it does, set scanner_mount")
+    yaw = math.atan2(whole[1, 0], whole[0, 0])
+    return Mount(x=float(whole[0, 3]), y=float(whole[1, 3]), yaw=yaw), -1 if tilt > math.pi / 2 else 1
