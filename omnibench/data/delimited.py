@@ -266,7 +266,7 @@ class _Text:
     """A delimited text. source: what polars reads, a file, a text in memory or a temporary file. lines: its lines."""
 
     file: Path
-    source: Path | BytesIO | Any
+    source: Path | bytes | Any
     separator: str
     lines: Lines
     decimal_comma: bool
@@ -277,13 +277,11 @@ class _Text:
         numeric: which columns hold numbers; where they hold a text further down, all are read as texts. DataError: the
         text cannot be read, or a row has too many fields.
         """
-        text = self.source if isinstance(self.source, Path | BytesIO) else Path(self.source.name)
+        text = self.source if isinstance(self.source, Path | bytes) else Path(self.source.name)
         reason: Exception | None = None
         for numbers in (numeric, [False] * len(numeric)):
             schema = {str(place): pl.Float64 if number else pl.String for place, number in enumerate(numbers)}
             try:
-                if isinstance(text, BytesIO):
-                    text.seek(0)
                 frame = pl.scan_csv(
                     text, has_header=False, separator=self.separator, skip_lines=skipped, schema=schema, glob=False
                 )
@@ -295,11 +293,10 @@ class _Text:
                 return pl.scan_parquet(scratch.name, glob=False)
             except (pl.exceptions.PolarsError, OSError) as error:
                 reason = error
-        opened = TextIOWrapper(text, encoding="utf-8") if isinstance(text, BytesIO) else text.open(encoding="utf-8-sig")
+        opened = BytesIO(text) if isinstance(text, bytes) else text.open("rb")
         try:
-            with opened:
-                opened.seek(0)
-                rows = csv.reader(islice(opened, skipped, None), delimiter=self.separator)
+            with TextIOWrapper(opened, encoding="utf-8-sig") as decoded:
+                rows = csv.reader(islice(decoded, skipped, None), delimiter=self.separator)
                 for row, fields in enumerate(rows):
                     if fields and len(fields) != len(numeric):
                         raise self.ragged(fields, numeric, skipped, row)
@@ -314,7 +311,7 @@ class _Text:
         return row_error(self.file, row, int(self.lines[skipped + row]), what)
 
 
-def _source_of(file: Path, separator: str | None) -> tuple[Path | BytesIO | Any, list[str], Lines]:
+def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, list[str], Lines]:
     """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
     check_file(file, _MOST_BYTES, text=True)
     try:
@@ -338,7 +335,7 @@ def _source_of(file: Path, separator: str | None) -> tuple[Path | BytesIO | Any,
         read_text(file)  # which says that it is no text
         raise
     cleaned.flush()
-    return cleaned, first, np.array(numbers)
+    return cleaned if large else cleaned.getvalue(), first, np.array(numbers)
 
 
 def _are_units(cells: Sequence[str], following: Sequence[str]) -> bool:

@@ -73,27 +73,17 @@ class Topic:
         return otherwise if header is None else int(header.stamp.sec) * SECOND + int(header.stamp.nanosec)
 
 
-@dataclass(frozen=True, eq=False)
-class WheelClock:
-    """The clock of the wheels' messages: stamps (F,) and times of recording (F,), ns; the first stamp is t = 0."""
-
-    topic: str
-    stamps: Stamps
-    logged: Stamps
-
-    def seconds(self, stamps: Stamps) -> Array:
-        """Times, s since the first message; exact to the nanosecond, which a double of unix time is not."""
-        return np.asarray((stamps - self.stamps[0]) / SECOND)
-
-
 class Bag:
     """An open bag; see :func:`open_bag`.
 
-    recorded: names of topics of which the times of recording count. clock: of the wheels, once these are read. notes:
-    what was left out of its messages.
+    recorded: names of topics of which the times of recording count. notes: what was left out of its messages.
+    clock_topic, clock_stamps, clock_logged: of the wheels' messages, once these are read, stamps (F,) and times of
+    recording (F,), ns; the first stamp is t = 0.
     """
 
-    clock: WheelClock
+    clock_topic: str
+    clock_stamps: Stamps
+    clock_logged: Stamps
 
     def __init__(
         self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: list[str]
@@ -145,30 +135,32 @@ class Bag:
             found = f"only {number} of {plural(topic.messages, 'message')} on {topic.name} can be found"
             raise DataError(f"{self.path}: {found}; its index is damaged; {_repair(self.path)}")
 
-    def seconds(self, topic: Topic, stamps: Stamps) -> Array:
-        """Times of a topic's messages, s, by the wheels' clock. DataError: no two are within the wheels' recording."""
-        clock = self.clock
-        if ((stamps >= clock.stamps[0]) & (stamps <= clock.stamps[-1])).sum() < 2:
-            spans = [f"{span[0] / SECOND:.3f} to {span[-1] / SECOND:.3f} s" for span in (stamps, clock.stamps)]
-            raise DataError(
-                f"{self.path}: no two messages of {topic.name} while the wheels were recorded, by the stamps of their "
-                f"headers ({topic.name} {spans[0]}, {clock.topic} {spans[1]}); both must be stamped by one clock, or "
-                f"set recorded_stamps=[{clock.topic},{topic.name}] to take the times of recording"
-            )
-        return clock.seconds(stamps)
+    def seconds(self, stamps: Stamps, topic: Topic | None = None) -> Array:
+        """Times, s since the wheels' first message; exact to the nanosecond, which a double of unix time is not.
+
+        DataError: they are of a topic of which no two messages are within the wheels' recording.
+        """
+        wheels = self.clock_stamps
+        if topic is not None and ((stamps >= wheels[0]) & (stamps <= wheels[-1])).sum() < 2:
+            spans = [f"{span[0] / SECOND:.3f} to {span[-1] / SECOND:.3f} s" for span in (stamps, wheels)]
+            what = f"no two messages of {topic.name} while the wheels were recorded, by the stamps of their headers"
+            shown = f"{topic.name} {spans[0]}, {self.clock_topic} {spans[1]}"
+            way = f"set recorded_stamps=[{self.clock_topic},{topic.name}] to take the times of recording"
+            raise DataError(f"{self.path}: {what} ({shown}); both must be stamped by one clock, or {way}")
+        return np.asarray((stamps - wheels[0]) / SECOND)
 
     def timed(self, topic: Topic) -> list[tuple[float, Any]]:
         """Times, s, by the wheels' clock, and messages of a topic, in this order.
 
         A time is that of a header, or by when the message was recorded, as the wheels' messages have both.
         """
-        order = np.argsort(self.clock.logged, kind="stable")
-        logged, wheels = self.clock.logged[order], np.maximum.accumulate(self.clock.stamps[order])
+        order = np.argsort(self.clock_logged, kind="stable")
+        logged, wheels = self.clock_logged[order], np.maximum.accumulate(self.clock_stamps[order])
         records = list(self.records(topic))
         stamps = np.array([topic.stamp(message, 0) for _, _, message in records], dtype=np.int64)
         recorded = np.array([when for _, when, _ in records], dtype=np.int64)
-        by_recording = np.interp(recorded - logged[0], logged - logged[0], self.clock.seconds(wheels))
-        times = np.where(stamps != 0, self.clock.seconds(stamps), by_recording)
+        by_recording = np.interp(recorded - logged[0], logged - logged[0], self.seconds(wheels))
+        times = np.where(stamps != 0, self.seconds(stamps), by_recording)
         return [(float(times[row]), records[row][2]) for row in np.argsort(times, kind="stable")]
 
     def fields(self, kind: str, before: str = "") -> dict[str, str]:
@@ -446,7 +438,7 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
             raise DataError(f"{place}: the bag has changed since it was opened; import it again")
         return ranges
 
-    return ScanReadings(scanner, place, bag.seconds(topic, stamps), read)
+    return ScanReadings(scanner, place, bag.seconds(stamps, topic), read)
 
 
 def _laser_scan(message: Any) -> tuple[ScanShape, bool, str, float, float]:

@@ -362,7 +362,7 @@ def read_sensor(bag: Bag, topic: Topic, options: SensorOptions) -> SensorReading
         altitude, (latitude, longitude) = float(table[rows[0], 3]), values[0].tolist()
         height = altitude if abs(altitude) < _HIGHEST else 0.0
         values = east_north(values[:, 0], values[:, 1], (latitude, longitude), height)
-    times = bag.seconds(topic, messages.stamps[rows])
+    times = bag.seconds(messages.stamps[rows], topic)
     times = times + (options.pose_time_offset + options.pose_time_drift * (times - times[0]))
     return SensorReadings(kind, times, values, sigmas)
 
@@ -487,10 +487,10 @@ def read_wheels(bag: Bag, wheels: Sequence[Topic], steering: Sequence[Topic], op
         shown = ", ".join(topic.name for topic in dict.fromkeys((*wheels, *steering)))
         way = "all must be stamped by one clock, or be named in recorded_stamps"
         raise DataError(f"{bag.path}: topics {shown} hold no messages of one time; {way}")
-    bag.clock = bags.WheelClock(wheels[0].name, first.stamps[covered], first.logged[covered])
-    times, values, read_at = bag.clock.seconds(bag.clock.stamps), [], []
+    bag.clock_topic, bag.clock_stamps, bag.clock_logged = wheels[0].name, first.stamps[covered], first.logged[covered]
+    times, values, read_at = bag.seconds(bag.clock_stamps), [], []
     for stream in turning + steered:
-        stamps, numbers = bag.clock.seconds(stream.stamps), stream.values
+        stamps, numbers = bag.seconds(stream.stamps), stream.values
         if several and stream.unit.endswith("/sample"):  # there may be several between two messages of the first
             numbers = np.cumsum(numbers, axis=0)
         nearest = np.searchsorted((stamps[1:] + stamps[:-1]) / 2, times)
@@ -578,7 +578,7 @@ def read_poses(bag: Bag, topic: Topic, options: RosbagOptions) -> PoseReadings:
             if stated:
                 bag.notes.append(f"{unknown}, so that poses have none; set pose_sigma=[m,deg] to give them")
     apart = options.clocks == "match" or options.pose_time_offset
-    times = bag.clock.seconds(stamps) if apart else bag.seconds(topic, stamps)
+    times = bag.seconds(stamps, None if apart else topic)
     return PoseReadings(times, poses, covariances, len(columns) < 3, "" if topic.type in POSE_TYPES else topic.name)
 
 
@@ -669,7 +669,7 @@ def _sent_twists(bag: Bag, topic: Topic) -> Array | None:
     twists = twists[np.diff(twists[:, 1:], axis=0, prepend=np.inf).any(axis=1)]  # of equal ones the first
     if not len(twists):
         return None
-    end = max(float(bag.clock.seconds(bag.clock.stamps[-1:])[0]), twists[-1, 0])
+    end = max(float(bag.seconds(bag.clock_stamps[-1:])[0]), twists[-1, 0])
     return np.column_stack([twists, np.diff(twists[:, 0], append=end)])
 
 
