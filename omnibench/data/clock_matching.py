@@ -133,7 +133,13 @@ def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Arr
     """The coefficients h and s, and the clocks, that fit runs best together."""
     clocks = [each.scanned(search) for each in windows]
     for _ in range(ROUNDS):
-        fitted, before = _coefficients(windows, clocks), clocks
+        before, within = clocks, [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
+        changes = [each.columns(clock)[0] for each, clock in zip(windows, clocks, strict=True)]
+        fitted = []  # the coefficients that fit all runs best by their clocks
+        for row, channel in enumerate(windows[0].channels):
+            columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
+            shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
+            fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
         pairs = zip(windows, before, clocks, strict=True)
         if max(each.farthest_step(*np.subtract(old, new)) for each, old, new in pairs) < _SETTLED:
@@ -383,18 +389,6 @@ def _tick_time(driven: Array, durations: Array) -> float:
     counted = np.flatnonzero(busiest >= moved.min())
     intervals = np.diff(np.cumsum(durations)[counted])
     return float(np.median(intervals / busiest[counted[1:]]) * moved.min()) if len(intervals) else 0.0
-
-
-def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
-    """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
-    fitted = []
-    within = [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
-    changes = [each.columns(clock)[0] for each, clock in zip(windows, clocks, strict=True)]
-    for row, channel in enumerate(windows[0].channels):
-        columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
-        shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
-        fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
-    return fitted
 
 
 def _huber(residuals: Array) -> Array:

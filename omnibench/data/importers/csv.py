@@ -394,8 +394,11 @@ def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[Tab
         for name in sorted({*wheels, *poses, *of_one} - {pair.name for pair in pairs}):
             file = wheels.get(name) or poses.get(name) or of_one[name]
             endings, option = (pose_endings, "pose_suffix") if name in wheels else (wheel_endings, "wheel_suffix")
-            others = f"put other references into {name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
-            way = f"--set {option}=ENDING for other names, name a file of both as the source, or {others}"
+            way = f"--set {option}=ENDING for other names, or name a file of wheels and poses as the source"
+            if name in wheels:
+                way += (
+                    f"; distances, turns and the like go into {name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
+                )
             raise DataError(f"{file}: run {name!r} has no {' or '.join(name + end for end in endings)}; {way}")
     if pairs:
         return pairs
@@ -510,8 +513,8 @@ def read_measured(table: Table) -> References:
     A heading with t0 = 0 counts from the run's start. DataError names the row of what is wrong.
     """
     if "kind" not in table:
-        known = f"{', '.join(KINDS)} (omnibench guide references)"
-        raise DataError(f"{missing_column(table.file, 'kind', table.names)}; a row's kind is one of {known}")
+        way = f"a row needs its kind ({', '.join(KINDS)}), value and sigma (omnibench guide references)"
+        raise DataError(f"{missing_column(table.file, 'kind', table.names)}; {way}")
     kinds = np.array([kind.lower() for kind in table.texts("kind")], dtype=str)
     numbers = {name: np.full(len(table), np.nan) for name in NUMBERS}
     numbers |= {name: table.numbers([name])[:, 0] for name in NUMBERS if name in table}
