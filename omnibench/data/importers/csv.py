@@ -188,15 +188,11 @@ class Stream:
         return [key for key in self.keys if key not in self.names]
 
 
-def wheels_in(table: Table, options: CsvOptions, *, shared: bool) -> Stream:
-    """The columns of the wheels in a table. shared: poses stand in the same rows."""
-    return Stream("wheels", table, options.wheel_keys, options.names_in(table), shared)
-
-
-def poses_in(table: Table, options: CsvOptions, *, shared: bool) -> Stream:
-    """The columns of the poses in a table. shared: wheels stand in the same rows."""
+def streams_in(table: Table, options: CsvOptions, *, shared: bool) -> tuple[Stream, Stream]:
+    """The columns of the wheels and of the poses in a table. shared: both stand in the same rows."""
     names = options.names_in(table)
-    return Stream("poses", table, options.pose_keys(names, shared=shared), names, shared)
+    poses = Stream("poses", table, options.pose_keys(names, shared=shared), names, shared)
+    return Stream("wheels", table, options.wheel_keys, names, shared), poses
 
 
 def run_column(options: CsvOptions, table: Table) -> str | None:
@@ -396,9 +392,7 @@ def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[Tab
             endings, option = (pose_endings, "pose_suffix") if name in wheels else (wheel_endings, "wheel_suffix")
             way = f"--set {option}=ENDING for other names, or name a file of wheels and poses as the source"
             if name in wheels:
-                way += (
-                    f"; distances, turns and the like go into {name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
-                )
+                way += f"; distances and turns go into {name}{REFERENCE_ENDINGS[0]} (omnibench guide references)"
             raise DataError(f"{file}: run {name!r} has no {' or '.join(name + end for end in endings)}; {way}")
     if pairs:
         return pairs
@@ -417,17 +411,14 @@ def file_called(folder: Path, names: Sequence[str], *, other_than: Path | None =
 
 def load(file: Path, options: CsvOptions, *, poses: bool = False) -> Table:
     """The table of a file as the options say it is written. poses: it holds the poses alone."""
-    other = options.pose_header_lines if poses else None
+    other, commas = options.pose_header_lines if poses else None, options.decimal == "comma"
     lines = options.header_lines if other is None else other
     separator = None if options.separator == BLANKS else options.separator or delimited.AUTO
     try:
-        table = delimited.read_cells(
-            file, separator=separator, header_lines=lines, decimal_comma=options.decimal == "comma"
-        )
+        table = delimited.read_cells(file, separator=separator, header_lines=lines, decimal_comma=commas)
     except DataError as error:
-        if not poses or "--set header_lines" not in str(error):
-            raise
-        raise DataError(str(error).replace("--set header_lines", "--set pose_header_lines")) from None
+        key = "pose_header_lines" if poses else "header_lines"
+        raise type(error)(str(error).replace("--set header_lines", f"--set {key}")) from None
     # A table without a header that has exactly the columns that are wanted of one of its streams gets their names.
     for keys in () if table.headed else (options.wheel_keys, options.pose_keys({}, shared=False)):
         names = [options.accepted[key][0] for key in keys]
@@ -467,9 +458,9 @@ def _by_headers(
             notes.append(f"{file}: left out, as it has no rows")
             continue
         name = file.relative_to(source).with_suffix("").as_posix()
-        beside, poses = references(name), poses_in(table, options, shared=True)
+        beside, (wheels, poses) = references(name), streams_in(table, options, shared=True)
         posed = beside is None or any(key in poses.names for key in poses.keys[1:])
-        missing = [*wheels_in(table, options, shared=True).missing, *(poses.missing if posed else ())]
+        missing = [*wheels.missing, *(poses.missing if posed else ())]
         if missing:
             lacking.append((table, list(dict.fromkeys(missing))))
         else:
@@ -478,13 +469,13 @@ def _by_headers(
         raise DataError(f"{source}: none of its tables has rows ({_TEMPLATE})")
     if not fitting:
         # Some tables hold the wheels and others the poses, by names that do not say so.
-        of_wheels = [table.file for table, _ in lacking if not wheels_in(table, options, shared=False).missing]
-        of_poses = [table.file.name for table, _ in lacking if not poses_in(table, options, shared=False).missing]
+        apart = [streams_in(table, options, shared=False) for table, _ in lacking]
+        of_wheels, of_poses = ([each.table.file for each in of if not each.missing] for of in zip(*apart, strict=True))
         if of_wheels and of_poses:
             way = (
                 "call them <run>_wheels.csv and <run>_poses.csv, or --set wheel_suffix=ENDING --set pose_suffix=ENDING"
             )
-            raise DataError(f"{of_wheels[0]} holds wheels and {of_poses[0]} poses; {way}")
+            raise DataError(f"{of_wheels[0]} holds wheels and {of_poses[0].name} poses; {way}")
         raise missing_error(*min(lacking, key=lambda pair: len(pair[1])), options)
     if lacking:
         others = some([table.file.relative_to(source).as_posix() for table, _ in lacking])
@@ -583,10 +574,10 @@ def _recordings(
     names, or say another unit.
     """
     shared, table = files.wheels == files.poses, load(files.wheels, options)
-    streams = [wheels_in(table, options, shared=shared)]
-    if files.poses is not None and files.poses.suffix != ".tum":
-        posed = table if shared else load(files.poses, options, poses=True)
-        streams.append(poses_in(posed, options, shared=shared))
+    streams = list(streams_in(table, options, shared=shared))
+    if not shared:
+        apart = None if files.poses is None or files.poses.suffix == ".tum" else load(files.poses, options, poses=True)
+        streams[1:] = [] if apart is None else streams_in(apart, options, shared=False)[1:]
     missing = [(stream.table, stream.missing) for stream in streams]
     if shared:
         missing = [(table, list(dict.fromkeys(key for stream in streams for key in stream.missing)))]

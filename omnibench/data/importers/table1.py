@@ -32,7 +32,7 @@ from omnibench.data.scans import Scanner
 from omnibench.data.splits import every_second, repetitions
 from omnibench.errors import DataError
 from omnibench.registry import importers
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
 _COMMAND = ("v", "alpha", "omega", "d")
@@ -40,13 +40,11 @@ _POSE = ("x", "y", "theta")
 _SENT = ("v", "alpha", "omega", "t_r")
 _WAY_OUT = "set scanner={rays: 1080, angle_min: -2.356, ..., mount: {x: 0.1, y: 0, yaw: 0}} (m, rad)"
 
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle), roller_angle=0.0)
-        for name, angle in (("a", 60), ("b", 180), ("c", 300))
-    ),
-)
+_WHEELS = [
+    {"name": name, "radius": 0.148, "distance": 0.195, "angle_deg": angle}
+    for name, angle in (("a", 60), ("b", 180), ("c", 300))
+]
+APR_02 = Robot.model_validate({"name": "APR-02", "wheels": _WHEELS})
 """The design values behind Eq. (7)."""
 
 UTM_30LX = Scanner(
