@@ -32,7 +32,7 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 TimeUnit = Literal["s", "ms", "us", "ns"]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HeadingUnit = Literal["rad", "deg"]
-RADIANS = {"rad": 1.0, "deg": math.pi / 180}
+RADIANS = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "ticks": 2 * math.pi, "rpm": 2 * math.pi / 60}
 Position = Literal["rad", "deg", "rev", "ticks"]
 WheelPosition = Literal[Position, "m", "mm", "inch"]
 WheelRate = Literal["rad/s", "deg/s", "rev/s", "rpm", "ticks/s", "m/s", "mm/s", "inch/s"]
@@ -41,7 +41,6 @@ WheelUnit = Literal[WheelPosition, WheelRate, WheelStep]
 Quantity = Literal["positions", "rates", "increments"]
 TURNS = {"rad": 2 * math.pi, "deg": 360.0, "rev": 1.0}
 """Positions in a turn."""
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "ticks": 2 * math.pi, "rpm": 2 * math.pi / 60}
 _POWER = re.compile(r"2\s*(?:\^|\*\*)\s*(\d{1,2})")
 _WRAPS = ("auto", "never")
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
@@ -132,7 +131,7 @@ class RunAttributes:
     split: Split | None = None
     session: str | None = None
     started_at: float | None = None
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, float | None] = field(default_factory=dict)
     sent: Array | None = None
 
 
@@ -373,7 +372,7 @@ class ReferenceOptions(RecordingOptions):
     def wheel_factors(self, unit: str) -> Array:
         """Factors (N,) from a unit to rad, or rad/s, of the wheels in the robot's sense."""
         base = unit.partition("/")[0]
-        radians = METRES[base] / self.robot.radii if base in METRES else np.array(_ANGLES[base])
+        radians = METRES[base] / self.robot.radii if base in METRES else np.array(RADIANS[base])
         factors = radians / np.array(self.ticks_per_turn or 1) / np.array(self.gear_ratio or 1)
         return np.broadcast_to(factors * np.array(self.wheel_signs or 1), len(self.robot.wheel_names))
 

@@ -137,18 +137,14 @@ def recordings_of(
         covariances = None if run.pose_covariances is None else run.pose_covariances[:, poses][:, :, poses]
         seen = PoseReadings(run.pose_times, run.poses[:, poses], covariances) if run.start_known else None
         measured = None if run.references is None else run.references.open_ended(float(run.times[-1]))
-        said = {key: getattr(run, key) for key in ("command", "repetition", "split", "session", "started_at")}
+        known = {key: getattr(run, key) for key in ("command", "repetition", "split", "session", "started_at")}
         numbers = {key: getattr(run, key) for key in ("v", "alpha", "omega", "duration", "distance")}
-        numbers = {key: value for key, value in numbers.items() if value is not None}
         sent = None if run.sent is None else run.sent * (second, 1, 1, 1, second)
-        attributes = RunAttributes(**said, numbers=numbers, sent=sent)
-        seeing = None
+        said, seeing = RunAttributes(**known, numbers=numbers, sent=sent), None
         if scans is not None and run.id in scanned:
             seeing = ScanReadings(scans.scanner, run.id, scans.times(run.id), partial(_ranges, scans, run.id))
         place = f"trajectory {run.id}"
-        recordings.append(
-            Recording(run.id, place, readings, seen, measured, attributes=attributes, scans=seeing, a_run=True)
-        )
+        recordings.append(Recording(run.id, place, readings, seen, measured, attributes=said, scans=seeing, a_run=True))
     return recordings
 
 

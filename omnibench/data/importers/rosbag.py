@@ -280,24 +280,18 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
         twists = [topic for topic in bag.of_type(*_TWISTS) if topic.name.endswith("cmd_vel")]
         beside = [topic for topic in twists if topic.namespace == topics[0].namespace]
         sent = next((each[0] for each in (twists, beside) if len(each) == 1), None)
-        events = [bag.topic(options.cut_topic, "cut_topic")] if options.cut_topic else []
+        cutting = bag.topic(options.cut_topic, "cut_topic") if options.cut_topic else None
         wheels = read_wheels(bag, topics, steering, options)
         readings = [read_sensor(bag, topic, options) for topic in sensors]
         try:
             seen = bags.read_scans(bag, scans[0], options.scanner_mount) if scans else None
         except (ConfigError, DataError) as error:
             raise DataError(f"{error}; scans=false leaves the scans out") from None
-        return Recording(
-            name,
-            f"{path}: topic {topics[0].name}",
-            wheels,
-            read_poses(bag, references[0], options) if references else None,
-            events=tuple(event for topic in events for event in _events(bag, topic)),
-            attributes=RunAttributes(sent=_sent_twists(bag, sent) if sent else None),
-            scans=seen,
-            sensors=BagSensors(readings, options) if readings else None,
-            numbered=True,
-        )
+        place, sensed = f"{path}: topic {topics[0].name}", BagSensors(readings, options) if readings else None
+        poses = read_poses(bag, references[0], options) if references else None
+        events = _events(bag, cutting) if cutting else ()
+        said = RunAttributes(sent=_sent_twists(bag, sent) if sent else None)
+        return Recording(name, place, wheels, poses, None, events, said, seen, sensed, numbered=True)
 
 
 def east_north(latitudes: Array, longitudes: Array, origin: tuple[float, float], height: float = 0.0) -> Array:

@@ -151,13 +151,10 @@ def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
         sent = np.column_stack(_timed(file, _SENT)) * (1, 1, RADIANS["deg"], 1, 1)
     if (file := folder / "lidar.csv").exists():
         scans = _scans(file, options.scanner, float(pose_times[0]), float(times[-1]))
-    attributes = RunAttributes(
-        f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}",
-        split=next((split for split in SPLITS if split in name.split("/")), None),
-        session=name.rpartition("/")[0] or None,
-        numbers={"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance},
-        sent=sent,
-    )
+    command, session = f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}", name.rpartition("/")[0] or None
+    split = next((split for split in SPLITS if split in name.split("/")), None)
+    numbers = {"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance}
+    attributes = RunAttributes(command, split=split, session=session, numbers=numbers, sent=sent)
     readings = WheelReadings(times, rates, options.wheel_unit, begin=0.0, others=others)
     place = str(folder / "slam.csv")
     return Recording(name, place, readings, PoseReadings(pose_times, poses), attributes=attributes, scans=scans)
