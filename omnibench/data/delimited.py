@@ -200,13 +200,20 @@ class Table:
             return self.frame.select(columns).collect()
 
 
-def read_cells(file: Path, *, separator: str | None = ",", header_lines: int = 1, decimal_comma: bool = False) -> Table:
+def read_cells(
+    file: Path,
+    required: Sequence[str] = (),
+    *,
+    separator: str | None = ",",
+    header_lines: int = 1,
+    decimal_comma: bool = False,
+) -> Table:
     """The table of a delimited text file, or of a Parquet file, in which dates become seconds since 1970.
 
     The last of the header lines names the columns, and a row of units may follow; without header lines columns are
     numbered. separator: None for white space, with comments from ``#`` on; ``auto``: a semicolon, a tab or a comma,
-    whichever the header holds. Blank lines are skipped. DataError: the file cannot be read, it has no rows
-    (NoRowsError), a row has more fields than columns.
+    whichever the header holds. Blank lines are skipped. DataError: the file cannot be read, a column that is required
+    is missing or named twice (ColumnError), it has no rows (NoRowsError), a row has more fields than columns.
     """
     if file.suffix == ".parquet":
         rows, frame = scan_table(file)
@@ -231,6 +238,8 @@ def read_cells(file: Path, *, separator: str | None = ",", header_lines: int = 1
         names = (names[0].lstrip("# "), *names[1:])  # as numpy.savetxt writes it
     else:
         names = tuple(str(number) for number in range(1, len(first[0]) + 1)) if first else ()
+    for name in required:
+        _place(file, name, names)
     body = first[header_lines:]
     units = tuple(cell.strip() for cell in body[0]) if header_lines and len(body) > 1 and _are_units(*body[:2]) else ()
     skipped = header_lines + bool(units)
@@ -352,7 +361,7 @@ def read_numbers(file: Path, required: Sequence[str], *, separator: str | None =
     (ColumnError), a field is not a finite number.
     """
     try:
-        table = read_cells(file, separator=separator, header_lines=header_lines)
+        table = read_cells(file, required if header_lines else (), separator=separator, header_lines=header_lines)
     except NoRowsError as error:
         raise DataError(f"{error}" + ("" if header_lines else f"; a row is {' '.join(required)}")) from None
     if not header_lines and not any(name.isdecimal() for name in required):
