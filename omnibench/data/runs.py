@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from omnibench.data.aligned import AlignedRecording, WheelSamples, aligned_recordings
 from omnibench.data.clock_matching import usual_period
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
-from omnibench.data.jumps import reference_jumps
 from omnibench.data.recording import (
     Event,
     PoseReadings,
@@ -33,6 +32,7 @@ from omnibench.data.references import LATE, TURN
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch, StoredSequence
 from omnibench.data.splits import complete, divided, every_second, remaining
+from omnibench.data.spoiled_references import reference_jumps
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot, interpolated
 from omnibench.robot.model import OdometryModel
