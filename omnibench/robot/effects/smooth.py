@@ -180,6 +180,7 @@ def smooth_effect(
 
     def register(function: Callable[[Signals, Values], Array]) -> type[SmoothEffect]:
         members = {
+            "__module__": function.__module__,
             "__doc__": function.__doc__,
             "shows_in": covariate.shows_in,
             "needs": covariate.needs,
