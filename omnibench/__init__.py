@@ -30,7 +30,7 @@ _PUBLIC = {
     "load_dataset": "data.storage",
     "load_plugins": "registry",
     "make_dataset": "data.dataset",
-    "odometry": "robot.dead_reckoning",
+    "odometry": "robot.calibration",
     "read_calibration": "robot.calibration",
     "read_compare_config": "compare.config",
     "read_live_config": "live.config",
@@ -76,9 +76,9 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.live.wire.subscriber import subscribe as subscribe
     from omnibench.registry import load_plugins as load_plugins
     from omnibench.robot.calibration import Calibration as Calibration
+    from omnibench.robot.calibration import odometry as odometry
     from omnibench.robot.calibration import read_calibration as read_calibration
     from omnibench.robot.calibration import write_calibration as write_calibration
-    from omnibench.robot.dead_reckoning import odometry as odometry
     from omnibench.robot.export.formats import export_calibration as export_calibration
     from omnibench.robot.kinematics import Robot as Robot
     from omnibench.robot.kinematics import Wheel as Wheel

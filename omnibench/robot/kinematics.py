@@ -37,6 +37,8 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    PlainSerializer,
+    PlainValidator,
     SerializerFunctionWrapHandler,
     model_serializer,
     model_validator,
@@ -44,9 +46,20 @@ from pydantic import (
 
 from omnibench.config import Model, Name
 from omnibench.errors import UnknownNameError
-from omnibench.robot.arrays import Array as Array
-from omnibench.robot.arrays import JsonArray as JsonArray
 from omnibench.views import Shown
+
+Array = NDArray[np.floating[Any]]
+
+
+def _as_lists(array: Array) -> list[Any]:
+    """Nested lists; of texts where JSON has no number for an element."""
+    return (array if np.isfinite(array).all() else array.astype(str)).tolist()
+
+
+# An array as a field that pydantic writes as nested lists and reads back to the last bit.
+JsonArray = Annotated[
+    Array, PlainValidator(lambda values: np.array(values, dtype=float)), PlainSerializer(_as_lists, list[Any])
+]
 
 WheelType = Literal["omni", "mecanum", "fixed", "steered"]
 RobotClass = Literal["omni", "mecanum", "differential", "skid", "tricycle", "car", "swerve", "mixed"]
