@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused
+from driven_path import DrivenPath
 from effect_samples import (
     EVERY,
     MOTION,
@@ -38,7 +39,7 @@ from omnibench.robot.effects.learned import unpacked
 from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath, Integration, OdometryStream, WheelLog, advance
+from omnibench.robot.odometry import Integration, OdometryStream, WheelLog, advance
 from omnibench.robot.signals import Signals, SignalStream, signals_of, smoothing_share
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")

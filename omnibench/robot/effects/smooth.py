@@ -18,7 +18,7 @@ from numpy.polynomial import chebyshev
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, Need, Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.wheels import EachWheelEffect, has_rollers, of_wheels
+from omnibench.robot.effects.textbook import EachWheelEffect, has_rollers, of_wheels
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals, needed
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from omnibench.errors import ConfigError, UnknownNameError, one_line, require_type
 from omnibench.robot.calibration import Calibration, Noise
-from omnibench.robot.effects.wheels import KNEE
+from omnibench.robot.effects.textbook import KNEE
 from omnibench.robot.export import ros2_controllers
 from omnibench.robot.export.ros2_controllers import Parameter, RemainingError, interval_in_words, to_node
 from omnibench.robot.kinematics import CarDrive, Mount
