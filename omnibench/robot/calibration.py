@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, get_args
@@ -85,8 +86,7 @@ class EffectTerm(config.Model):
     @classmethod
     def of(cls, term: Term) -> EffectTerm:
         """A term of a model, as a file holds it."""
-        values = {name: float(value) for name, value in term.values.items()}
-        return cls(name=term.name, parameters=values, weights=term.weights)
+        return cls(name=term.name, parameters=dict(term.values), weights=term.weights)
 
     @property
     def numbers_in_words(self) -> Iterator[str]:
@@ -432,10 +432,7 @@ def covariance_rows(covariance: Array) -> tuple[Row, ...]:
 
 def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
-    try:
-        return _checked(config.read_yaml(Path(path)), str(path))
-    except ConfigError as error:
-        raise DataError(str(error)) from None
+    return _checked(partial(config.read_yaml, Path(path)), str(path))
 
 
 def parse_calibration(text: str, where: str, most: int = config.MOST_VALUES) -> Calibration:
@@ -443,19 +440,21 @@ def parse_calibration(text: str, where: str, most: int = config.MOST_VALUES) -> 
 
     most: values that the text may have.
     """
+    return _checked(partial(config.parse_yaml, text, where, most), where)
+
+
+def _checked(read: Callable[[], Any], where: str) -> Calibration:
+    """The calibration of a document. DataError: it cannot be read, or is none."""
     try:
-        return _checked(config.parse_yaml(text, where, most), where)
+        content = read()
+        version = content.get("format") if isinstance(content, dict) else None
+        if version != FORMAT:
+            raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
+        calibration = config.validate(Calibration, content, where)
+        for term in calibration.effects:
+            term.term(calibration.robot, where)
     except ConfigError as error:
         raise DataError(str(error)) from None
-
-
-def _checked(content: Any, where: str) -> Calibration:
-    version = content.get("format") if isinstance(content, dict) else None
-    if version != FORMAT:
-        raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
-    calibration = config.validate(Calibration, content, where)
-    for term in calibration.effects:
-        term.term(calibration.robot, where)
     return calibration
 
 

@@ -142,6 +142,8 @@ def _looks_like_radians(angle: float) -> float:
 
 
 _Angle = Annotated[FiniteFloat, AfterValidator(_looks_like_radians)]
+_Length = Annotated[FiniteFloat, Field(ge=1e-6, le=_FARTHEST)]
+_Place = Annotated[FiniteFloat, Field(ge=-_FARTHEST, le=_FARTHEST)]
 
 
 def in_degrees_too(*keys: str) -> Callable[[dict[str, Any]], None]:
@@ -168,16 +170,14 @@ class Wheel(Model):
     model_config = ConfigDict(json_schema_extra=in_degrees_too("angle", "roller_angle"))
 
     name: Name = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
-    radius: FiniteFloat = Field(ge=1e-6, le=1e3, description="m")
+    radius: _Length = Field(description="m")
     type: WheelType | None = Field(None, description="default: omni or mecanum, by the roller angle")
-    distance: FiniteFloat | None = Field(
-        None, ge=1e-6, le=_FARTHEST, description="lever arm about the robot's centre, m"
-    )
+    distance: _Length | None = Field(None, description="lever arm about the robot's centre, m")
     angle: _Angle | None = Field(
         None, description="direction of the axle (omni, mecanum) or of rolling (fixed, default 0), rad"
     )
-    x: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="in front of the robot's centre, m")
-    y: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="to the left of the centre, m")
+    x: _Place | None = Field(None, description="in front of the robot's centre, m")
+    y: _Place | None = Field(None, description="to the left of the centre, m")
     roller_angle: FiniteFloat = Field(0.0, gt=-1.5, lt=1.5, description="0 omni, +-pi/4 mecanum; rad")
     driven: bool = Field(True, description="steered wheels: false if only the steering angle is measured")
     measured: bool = Field(True, description="false for a wheel that only guides or rolls along")

@@ -23,7 +23,6 @@ from omnibench.robot.effects.effect import (
     body_change,
 )
 from omnibench.robot.kinematics import Array, CarDrive, Robot, class_of
-from omnibench.robot.odometry import Complex
 from omnibench.robot.signals import STILL, Signals, needed
 
 _PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
@@ -349,20 +348,15 @@ class LidarLeverArm(ReferenceEffect):
     )
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:
-        return _shifted(poses, _arm(poses, start, values))
+        return _by_arm(poses, start, complex(values["x"], values["y"]))
 
     def corrected(self, poses: Array, start: Array, values: Values) -> Array:
-        return _shifted(poses, -_arm(poses, start, values))
+        return _by_arm(poses, start, -complex(values["x"], values["y"]))
 
 
-def _arm(poses: Array, start: Array, values: Values) -> Complex:
-    """Displacement of the tracked point by the arm's rotation since the start: x + iy (K,), m."""
-    arm: Complex = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * complex(values["x"], values["y"])
-    return arm
-
-
-def _shifted(poses: Array, shift: Complex) -> Array:
-    """Poses (K, 3) with positions displaced by x + iy (K,), m."""
+def _by_arm(poses: Array, start: Array, arm: complex) -> Array:
+    """Poses (K, 3) displaced by the rotation of a lever arm x + iy, m, since the start."""
+    shift = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * arm
     return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
 
 

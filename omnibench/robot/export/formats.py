@@ -166,6 +166,7 @@ def _c_header(calibration: Calibration) -> Export:
         # A C literal that is read as exactly the same double
         "literal": lambda value: text if "." in (text := f"{float(value):.17g}") or "e" in text else f"{text}.0",
         "quoted": lambda names: ", ".join(f'"{name}"' for name in names),
+        "in_comment": lambda text: " ".join(text.split()).replace("*/", "* /"),
     }
     plain = _header_is_plain(calibration)
     held = {
@@ -173,13 +174,12 @@ def _c_header(calibration: Calibration) -> Export:
         for name, parameter in _IN_HEADER.items()
     }
     text = templates.get_template("odometry.h.j2").render(
-        comment=_provenance(calibration),
+        calibration=calibration,
+        left_out=left_out(calibration),
         prefix=prefix,
         upper=prefix.upper(),
         drive=robot.drive,
         ahead=float(np.mean(robot.drive.ahead, axis=0)[0]) if isinstance(robot.drive, CarDrive) else None,
-        period=calibration.sample_period,
-        integration=calibration.integration,
         matrix=(calibration.matrix_without_effects if plain else calibration.matrix_array).tolist(),
         counter_clockwise=all(wheel.lever > 0 for wheel in robot.measured),
         lost=held["wheel_dead_zone"],
@@ -210,30 +210,6 @@ def left_out(calibration: Calibration) -> str:
     plain = _header_is_plain(calibration)
     others = tuple(term for term in calibration.effects if plain or term.name not in _IN_HEADER)
     return calibration.model_copy(update={"effects": others}).effects_in_words
-
-
-def _provenance(calibration: Calibration) -> str:
-    """The C header's comment: where its matrix comes from, and what it leaves out."""
-    lines = [
-        f"Odometry of {calibration.robot.name}, written by omnibench from the calibration {calibration.name}",
-        f"created {calibration.created.isoformat()}; wheels in this order: {', '.join(calibration.robot.wheel_names)}",
-    ]
-    origin = calibration.provenance
-    if origin is None:
-        lines.append("provenance: not recorded")
-    else:
-        lines += [
-            f"dataset {origin.dataset}{' (simulated)' if origin.simulated else ''}, hash {origin.dataset_hash}",
-            f"calibrator {origin.calibrator}, seed {origin.seed}, cost {origin.cost}, box {origin.box}",
-            f"outcome {origin.outcome} {origin.reason}",
-        ]
-        costs = (("training", origin.training_cost), ("validation", origin.validation_cost))
-        lines += [f"{name} cost {cost:.6g}" for name, cost in costs if cost is not None]
-    if calibration.robot.mount is not None:
-        lines.append("the pose is that of the tracked point, which is not the robot's centre (mount)")
-    if omitted := left_out(calibration):
-        lines.append(f"left out: effects {omitted}")
-    return "\n".join(f" * {' '.join(line.split())}".replace("*/", "* /") for line in lines)
 
 
 EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(

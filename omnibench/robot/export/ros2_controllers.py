@@ -166,16 +166,12 @@ def covariance_parameters(calibration: Calibration, controller: Controller) -> t
     pose = pose_variances(calibration, controller.base)
     if pose is None:
         return ()
-    quantities = (
-        ("pose", pose, "m2, rad2: what 1 s adds"),
-        (
-            "twist",
-            pose / calibration.sample_period,
-            f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}",
-        ),
-    )
+    per_message = f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}"
     parameters = []
-    for quantity, variances, comment in quantities:
+    for quantity, variances, comment in (
+        ("pose", pose, "m2, rad2: what 1 s adds"),
+        ("twist", pose / calibration.sample_period, per_message),
+    ):
         x, y, heading = (f"{value:.6e}" for value in variances.tolist())
         diagonal = (x, y, "0.0", "0.0", "0.0", heading)
         parameters.append(Parameter(controller.covariances.format(quantity), diagonal, comment))
