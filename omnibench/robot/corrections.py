@@ -59,7 +59,7 @@ def corrected(terms: Sequence[Term], signals: Signals) -> Corrected:
     """
     sums: dict[str, Array | None] = {"wheel": signals.rates, "steering": signals.steering}
     count, wheels = signals.rates.shape
-    widths = {"body": 3, "world": 2, "steering": len(signals.robot.drive.steered)}
+    widths = {"body": 3, "world": 2, "steering": 0 if signals.steering is None else signals.steering.shape[1]}
     for term in terms:
         effect = term.effect
         assert isinstance(effect, MotionEffect)

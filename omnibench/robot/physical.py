@@ -547,11 +547,8 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
     for name in of_effects:
         design.setdefault(name, 1.0 if name.startswith("steering_gain") else at_design.get(name, 0.0))
 
-    spread, reported = np.zeros((len(at_design), len(columns))), np.zeros((len(design), len(columns)))
-    for column, (changes, shown) in enumerate(columns):
-        for rows, named, table in ((list(at_design), changes, spread), (list(design), shown, reported)):
-            for name, change in named.items():
-                table[rows.index(name), column] = change
+    spread = np.array([[changes.get(name, 0.0) for changes, _ in columns] for name in at_design])
+    reported = np.array([[shown.get(name, 0.0) for _, shown in columns] for name in design])
     return _ClassModel(geometry, spread, design, reported)
 
 

@@ -168,10 +168,7 @@ class SmoothEffect(WithoutCause, MotionEffect):
 
 
 def smooth_effect(
-    covariate: Covariate,
-    labels: Sequence[str],
-    *scales: Parameter,
-    modes: Sequence[str] = ALL_MODES,
+    covariate: Covariate, labels: Sequence[str], *scales: Parameter, modes: Sequence[str] = ALL_MODES
 ) -> Callable[[Callable[[Signals, Values], Array]], type[SmoothEffect]]:
     """Decorator: a function that computes ``shares`` of signals becomes the smooth effect of its name.
 

@@ -14,14 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import (
-    ActuatorEffect,
-    MotionEffect,
-    Parameter,
-    ReferenceEffect,
-    Values,
-    body_change,
-)
+from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Parameter, ReferenceEffect, Values, body_change
 from omnibench.robot.kinematics import Array, CarDrive, Robot, class_of
 from omnibench.robot.signals import STILL, Signals, needed
 
