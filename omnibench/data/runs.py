@@ -36,7 +36,7 @@ from omnibench.data.spoiled_references import reference_jumps
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, Robot, interpolated
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.samples import Samples
+from omnibench.robot.odometry import Samples
 from omnibench.words import plural, some
 
 _NUMBER = re.compile(
