@@ -504,10 +504,8 @@ def certify_optimum(
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     provenance = calibration.provenance
     if provenance is not None and provenance.loss is not None:
-        raise DataError(
-            f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}, and a bound is proven for a "
-            "cost without one; certify a calibration that was fitted without --loss"
-        )
+        fitted = f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}"
+        raise DataError(f"{fitted}, of which no bound is known; certify one that was fitted without --loss")
     settings = CompleteSettings(
         calibrator="closed_form",
         cost=CostChoice(name=provenance.cost) if provenance else CostChoice(),
@@ -527,9 +525,7 @@ def certify_optimum(
     if calibration.effects or weighed:
         optimum = run_calibrator(calibrators.create(settings.calibrator), problem)
         if optimum.vector is None or optimum.cost is None:
-            raise DataError(
-                f"calibration {calibration.name!r}: the optimum of the matrix alone is not found: {optimum.reason}"
-            )
+            raise DataError(f"{calibration.name!r}: the optimum of the matrix alone is not found: {optimum.reason}")
         if optimum.cost > problem.objective.rounding:  # no share of rounding means anything
             vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
     began = time.perf_counter()

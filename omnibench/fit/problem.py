@@ -65,66 +65,13 @@ class Improvement:
     cost: float
 
 
-class SearchBox:
-    """The box of a searched vector (n,): its names, its start, its bounds, and its part that is free.
-
-    free (n,): True for elements that may be searched; the others keep their start values.
-    """
-
-    def __init__(self, names: tuple[str, ...], start: Array, lower: Array, upper: Array) -> None:
-        self.names = names
-        self.start = _read_only(start)
-        self.lower = _read_only(lower)
-        self.upper = _read_only(upper)
-        self.free: NDArray[np.bool_] = _read_only(self.upper > self.lower)
-
-    @property
-    def size(self) -> int:
-        """The length n of the vector."""
-        return len(self.start)
-
-    @property
-    def held(self) -> tuple[str, ...]:
-        """Names of the elements that keep their start value, since the box has no width or the cost ignores them."""
-        return tuple(name for name, free in zip(self.names, self.free, strict=True) if not free)
-
-    def to_unit(self, vectors: Array) -> Array:
-        """Vectors (P, n) as points (P, f) of the unit cube over the f free elements, clipped to it."""
-        free = self.free
-        points = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
-        return np.clip(points, 0.0, 1.0)
-
-    def from_unit(self, points: Array) -> Array:
-        """Points (P, f) of the unit cube over the free elements as vectors (P, n), clipped to the box."""
-        points = np.atleast_2d(points)
-        vectors = np.empty((len(points), self.size))
-        vectors[:] = self.start
-        low, high = self.lower[self.free], self.upper[self.free]
-        vectors[:, self.free] = np.minimum(np.maximum(low + points * (high - low), low), high)
-        return vectors
-
-    def inside(self, vectors: Array) -> NDArray[np.bool_]:
-        """True (P,) for the vectors (P, n) that lie in the box, up to rounding."""
-        slack = _ROUNDING * np.maximum(np.abs(self.lower), np.abs(self.upper))
-        within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
-        return np.asarray(within.all(axis=-1))
-
-    def on_bounds(self, vectors: Array) -> NDArray[np.bool_]:
-        """True (..., n) for the free elements of vectors (..., n) that lie on a bound of the box."""
-        margin = _ON_BOUND * (self.upper - self.lower)
-        return np.asarray(self.free & ((vectors <= self.lower + margin) | (vectors >= self.upper - margin)))
-
-    def at_bounds(self, vector: Array) -> tuple[str, ...]:
-        """Names of the free elements that lie on a bound of the box."""
-        return tuple(name for name, touching in zip(self.names, self.on_bounds(vector), strict=True) if touching)
-
-
-class CalibrationProblem(SearchBox):
+class CalibrationProblem:
     """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
     trajectories: the training runs; a calibrator cannot reach the validation runs. moved_ends: a sentence on those of
     which the start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
-    start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
+    start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements. free (n,): True
+    for elements that may be searched; the others keep their start values.
     objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
     values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
     rng: the only source of randomness that a calibrator may use.
@@ -177,8 +124,10 @@ class CalibrationProblem(SearchBox):
         self.reference = _read_only(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
         bounds, start, relevant = parameterisation.bounds, parameterisation.start, self._relevant()
         self.box = bounds.name
-        lower, upper = np.where(relevant, bounds.lower, start), np.where(relevant, bounds.upper, start)
-        super().__init__(parameterisation.names, start, lower, upper)
+        self.names, self.start = parameterisation.names, _read_only(start)
+        self.lower = _read_only(np.where(relevant, bounds.lower, start))
+        self.upper = _read_only(np.where(relevant, bounds.upper, start))
+        self.free: NDArray[np.bool_] = _read_only(self.upper > self.lower)
         self.budget, self.evaluations, self.best_vector, self.best_cost = budget, 0, self.start, np.inf
         self.history: list[Improvement] = []
         self._watch, self._shown = watch, 0.0  # s after the begin when ``watch`` was last called
@@ -186,6 +135,45 @@ class CalibrationProblem(SearchBox):
         self._span = span
         self._evaluator: RunsEvaluator | None = None
         self._evaluator_tried = False
+
+    # The box.
+
+    @property
+    def size(self) -> int:
+        """The length n of the vector."""
+        return len(self.start)
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the elements that keep their start value, since the box has no width or the cost ignores them."""
+        return tuple(name for name, free in zip(self.names, self.free, strict=True) if not free)
+
+    def to_unit(self, vectors: Array) -> Array:
+        """Vectors (P, n) as points (P, f) of the unit cube over the f free elements, clipped to it."""
+        free = self.free
+        points = (np.atleast_2d(vectors)[:, free] - self.lower[free]) / (self.upper - self.lower)[free]
+        return np.clip(points, 0.0, 1.0)
+
+    def from_unit(self, points: Array) -> Array:
+        """Points (P, f) of the unit cube over the free elements as vectors (P, n), clipped to the box."""
+        points = np.atleast_2d(points)
+        vectors = np.empty((len(points), self.size))
+        vectors[:] = self.start
+        low, high = self.lower[self.free], self.upper[self.free]
+        vectors[:, self.free] = np.minimum(np.maximum(low + points * (high - low), low), high)
+        return vectors
+
+    def inside(self, vectors: Array) -> NDArray[np.bool_]:
+        """True (P,) for the vectors (P, n) that lie in the box, up to rounding."""
+        slack = _ROUNDING * np.maximum(np.abs(self.lower), np.abs(self.upper))
+        within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
+        return np.asarray(within.all(axis=-1))
+
+    def at_bounds(self, vector: Array) -> tuple[str, ...]:
+        """Names of the free elements that lie on a bound of the box."""
+        margin = _ON_BOUND * (self.upper - self.lower)
+        touching = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
+        return tuple(name for name, touches in zip(self.names, touching, strict=True) if touches)
 
     # What the runs identify.
 

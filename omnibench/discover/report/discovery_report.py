@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from omnibench.discover.report import tables
-from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
+from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
 from omnibench.discover.report.residuals import ALONE, EXTENDED, PLAIN
 from omnibench.discover.report.where_section import where_section
 from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
@@ -156,7 +156,7 @@ def sure_blocks(discovery: Discovery) -> Iterator[page.Block]:
             ),
             "tiles",
         )
-    yield from drawn(CANDIDATES, discovery)
+    yield from filter(None, [candidate_grid(discovery)])
     if discovery.left:
         caption = "What the residuals still depend on, after all that was added"
         yield tables.dependence_table(discovery.left, caption)
@@ -180,7 +180,7 @@ def _how_much_better(discovery: Discovery) -> Iterator[page.Block]:
     """The gain: errors before and after against the noise floor, on held-out runs."""
     if discovery.held_out:
         yield page.Paragraph(_better_in_words(discovery))
-    yield from drawn(GAPS, discovery)
+    yield from filter(None, [gap_grid(discovery), waterfall_grid(discovery)])
     yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
     if len(discovery.steps) > 1:
         yield page.Details("Every step in numbers", (tables.step_table(discovery),))

@@ -152,7 +152,10 @@ class Residuals:
         scale[np.diag(information) < 1e-12 * np.diag(information).max(initial=0.0)] = 0.0
         correlation = information * np.outer(scale, scale)
         inverse = np.linalg.pinv(correlation, rcond=_DETERMINED, hermitian=True) * np.outer(scale, scale)
-        determined = (scale > 0) & _is_estimable(correlation)
+        # Parameters that take no part in a direction that the data leave open.
+        sizes, vectors = np.linalg.eigh(correlation)
+        open_ones = vectors[:, sizes < _DETERMINED * max(float(sizes.max(initial=0.0)), 1e-300)]
+        determined = (scale > 0) & (np.square(open_ones).sum(axis=1) < 0.01)
         noise = self.spread * np.sqrt(np.maximum(np.diag(inverse), 0.0))
         cluster_scores = np.stack([scores[list(members)].sum(axis=0) for members in self._clusters])
         flipped = np.sqrt(np.square(np.einsum("ij,cjm->cim", inverse, cluster_scores)).sum(axis=0))
@@ -175,13 +178,6 @@ class Residuals:
         """The runs of each command, or each run by itself where commands are few."""
         commands = grouped([(run.command, run.id if run.command is None else None) for run in self.runs])
         return commands if len(commands) >= _COMMANDS else [(index,) for index in range(len(self.runs))]
-
-
-def _is_estimable(information: Array) -> NDArray[np.bool_]:
-    """True (n,) for parameters that take no part in a direction that the data leave open."""
-    values, vectors = np.linalg.eigh(information)
-    open_ones = vectors[:, values < _DETERMINED * max(float(values.max(initial=0.0)), 1e-300)]
-    return np.square(open_ones).sum(axis=1) < 0.01
 
 
 def shares(values: Array, edges: Sequence[float] | Array) -> Array:
@@ -370,10 +366,7 @@ def _band(panel: Panel, curve: Curve) -> go.Scatter:
                 at, half = at + np.array([-margin, margin]), np.repeat(half, 2)
             low = 0 * half if panel.amplitude else -half
             outlines.append(np.column_stack([np.append(at, at[::-1]), np.append(half, low[::-1])]))
-    key, colour = (NOISE.key, BAND) if panel.shared else (curve.style.key, _pale(curve.style.colour))
-    return area(key, colour, *joined(outlines).T)
-
-
-def _pale(colour: str) -> str:
-    red, green, blue = (int(colour[index : index + 2], 16) for index in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.16)"
+    if panel.shared:
+        return area(NOISE.key, BAND, *joined(outlines).T)
+    red, green, blue = (int(curve.style.colour[index : index + 2], 16) for index in (1, 3, 5))
+    return area(curve.style.key, f"rgba({red},{green},{blue},0.16)", *joined(outlines).T)

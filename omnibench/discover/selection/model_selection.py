@@ -455,77 +455,56 @@ class Selection:
 
 def select_effects(screening: Screening, rng: np.random.Generator) -> Selection:
     """Select the effects that explain what was screened, less those that encoder quantisation could explain."""
-    search = _search(screening, screening.groups.effects, rng)
+    found, pool, discrepancy = _search(screening, screening.groups.effects, rng)
     start, doubtful = screening.beyond_matrix(), set[str]()
     if screening.quantisation is not None:
         doubtful = {
             group.name
-            for group in (*search.chosen, *search.tentative)
+            for group in (*found.chosen, *found.tentative)
             if start.chi_square(group.index) <= screening.quantisation_chi_square(group)
         }
     if doubtful:
         others = [group for group in screening.groups.effects if group.name not in doubtful]
-        search = _search(screening, others, rng)
+        found, pool, discrepancy = _search(screening, others, rng)
     where = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
     # The weights of all names, and the names that could take the place of each chosen one
-    chosen = tuple(sorted(search.chosen, key=lambda group: -start.chi_square(group.index)))
-    of_positions = [
-        _probabilities(start, search.pool, chosen, position, search.discrepancy) for position in range(len(chosen))
-    ]
+    chosen = tuple(sorted(found.chosen, key=lambda group: -start.chi_square(group.index)))
+    of_positions = [_probabilities(start, pool, chosen, position, discrepancy) for position in range(len(chosen))]
     weights: dict[str, float] = {}
     for probabilities in of_positions:
         for group, probability in probabilities:
-            weights[group.name] = max(weights.get(group.name, 0.0), search.known * probability)  # Eq. (9) times (5)
+            weights[group.name] = max(weights.get(group.name, 0.0), found.known * probability)  # Eq. (9) times (5)
     stand_ins = tuple(
         tuple(other for other, probability in probabilities if other.name != group.name and probability > _CONFUSABLE)
         for group, probabilities in zip(chosen, of_positions, strict=True)
     )
-    return Selection(
-        chosen=chosen,
-        weights=weights,
-        known=search.known,
-        stand_ins=stand_ins,
-        steps=search.steps,
-        where=where,
-        left=search.left,
-        left_share=search.left_share,
-        tentative=search.tentative,
-    )
+    return replace(found, chosen=chosen, weights=weights, stand_ins=stand_ins, where=where)
 
 
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """Effects that a search chose or gave up, the pool of candidates, and else as in Selection."""
+def _search(
+    screening: Screening, candidates: Sequence[Group], rng: np.random.Generator
+) -> tuple[Selection, tuple[Group, ...], float]:
+    """Choose effects, and give them up again where their names are not credible.
 
-    chosen: tuple[Group, ...]
-    tentative: tuple[Group, ...]
-    pool: tuple[Group, ...]
-    steps: tuple[Significance, ...]
-    left: Significance
-    left_share: float
-    known: float
-    discrepancy: float
-
-
-def _search(screening: Screening, candidates: Sequence[Group], rng: np.random.Generator) -> _Search:
-    """Choose effects, and give them up again where their names are not credible."""
+    Returns the selection, without weights, stand-ins and ``where``; the pool of candidates; and the discrepancy.
+    """
     data, bases, start = screening.data, screening.groups.bases, screening.beyond_matrix()
     chosen, pool, steps = _forward_selection(screening, start, candidates, rng)
     fitted = screening.index_with(chosen)
     left = significance_of(data, fitted, bases, rng)
     if not chosen:
-        return _Search((), (), pool, steps, left, 0.0, 1.0, odds.DISCREPANCY)
+        return Selection((), {}, 1.0, (), steps, left, left, 0.0, ()), pool, odds.DISCREPANCY
     beyond = significance_of(data, [*fitted, *odds.form_columns(chosen)], bases, rng)
     sets = odds.effect_sets(start, pool, len(chosen))
     # Effective number of names that explain as much in the place that has most of them, Eq. (9)
     of_positions = (_probabilities(start, pool, chosen, position, odds.DISCREPANCY) for position in range(len(chosen)))
     alike = max(1 / sum(probability**2 for _, probability in of_position) for of_position in of_positions)
     credibility = odds.credibility_of(sets, start, chosen, left, beyond, alike)  # Eq. (9)
-    share, known, discrepancy = credibility.left_share, credibility.probability, credibility.discrepancy
+    share, known, tentative = credibility.left_share, credibility.probability, tuple[Group, ...]()
     if known < _CREDIBLE:
         left = significance_of(data, screening.groups.matrix.index, bases, rng)
-        return _Search((), chosen, pool, steps, left, share, known, discrepancy)
-    return _Search(chosen, (), pool, steps, left, share, known, discrepancy)
+        chosen, tentative = (), chosen
+    return Selection(chosen, {}, known, (), steps, left, left, share, tentative), pool, credibility.discrepancy
 
 
 def _forward_selection(

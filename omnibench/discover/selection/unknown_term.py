@@ -144,7 +144,8 @@ def _trials(
     """Functions of one covariate: those of whole columns, by stage, and those of fine structure."""
     for bases in surest_bases(screening, base, left, covariate):
         groups = list(_groups_of(bases, base.fit.model.robot))
-        data, limits = _linearised(base, groups), _limits_of(groups)
+        data = _linearised(base, groups)
+        limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
         choose = partial(_kept_functions, limits=limits)
         if kept := choose(given(data, [])):
             gains = _held_out_gains(data, len(limits), choose, folds)
@@ -251,13 +252,11 @@ def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:
     return base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
 
 
-def _limits_of(groups: Sequence[Group]) -> Array:
-    """The largest sizes (P,) that functions of some groups may have."""
-    return _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
-
-
 def _kept_functions(columns: Given, limits: Array) -> Sequence[int]:
-    """The functions that are chosen, by their numbers. columns: of a model, then of all functions."""
+    """The functions that are chosen, by their numbers.
+
+    columns: of a model, then of all functions. limits (P,): the largest sizes that these may have.
+    """
     first = len(columns.information) - len(limits)
     left, kept = columns.given(range(first)), list[int]()
     while len(kept) < len(limits):

@@ -17,12 +17,10 @@ from pydantic import Field
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost import SumOfNorms
 from omnibench.fit.linear_fit import linear_fit, minimum_in_turn, reweighted_minimum
 from omnibench.fit.loss import Loss, RobustCost, beginning_with_huber, norms_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.words import plural
 
@@ -56,7 +54,7 @@ class ClosedForm(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
-        from omnibench.fit.sum_of_norms import SolverError, SumOfNormsProgram
+        from omnibench.fit.sum_of_norms import SolverError, least_step
 
         self.needs_matrix(problem)
         objective, base = problem.objective, norms_of(problem.objective)
@@ -77,26 +75,32 @@ class ClosedForm(Calibrator):
                 problem, beginning_with_huber(objective), vector, self.options.tolerance, "reweighted"
             )
         cost = float(problem.cost(vector[None])[0])
+        shares, used = base.shares(problem.odometry.trajectory), np.flatnonzero(base.weights)
+        scale = np.array(base.weights)[used]
         newton_steps = cone_programs = 0
         work = "the linear fit"
         for _ in range(self.options.programs):
             if cost <= objective.rounding:  # a program would find no direction
                 return Solution(vector, f"no error is left after {work}")
-            program = SumOfNormsProgram(*_linearised(problem, base, vector))
+            # The best step of the cost with linear poses: residuals (S, k) and their jacobian (S, k, n).
+            before = problem.matrix(vector)
+            residuals = (problem.odometry.poses(before[None])[0] - problem.reference)[:, used] * scale
+            jacobian = (problem.odometry.jacobian(before)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
+            jacobian = jacobian @ problem.parameterisation.slopes(vector)
+            room = problem.lower - vector, problem.upper - vector
             try:
-                step = program.step(base.shares(problem.odometry.trajectory))
+                step, steps, programs = least_step(residuals, jacobian, shares, *room)
             except SolverError as error:
                 reason = f"{error} at a cost of {cost:.1e} in a cone program"
-                errors = len(problem.reference) * sum(map(bool, base.weights))
                 fitted = int(problem.free.sum())
-                if errors < 2 * fitted:  # usually errors are as few as the numbers fitted
-                    reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
+                if residuals.size < 2 * fitted:  # usually errors are as few as the numbers fitted
+                    reason += f": {residuals.size} errors for {fitted} numbers are met almost exactly, record more runs"
                 return Solution(vector, reason, converged=False)
-            newton_steps, cone_programs = newton_steps + program.newton_steps, cone_programs + program.cone_programs
+            newton_steps, cone_programs = newton_steps + steps, cone_programs + programs
             counts = ((newton_steps, "Newton step"), (cone_programs, "cone program"))
             work = " and ".join(plural(count, name) for count, name in counts if count)
             # The step, halved until the cost does not rise.
-            trial, before = problem.settled(vector + step), problem.matrix(vector)
+            trial = problem.settled(vector + step)
             for _ in range(_MOST_HALVINGS):
                 trial_cost = float(problem.cost(trial[None])[0])
                 if trial_cost <= cost or np.abs(trial - vector).max() < _NO_STEP:
@@ -111,14 +115,3 @@ class ClosedForm(Calibrator):
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {work}")
         return Solution(vector, f"step still {moved:.1e} after {work}", converged=False)
-
-
-def _linearised(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> tuple[Array, Array, Array, Array]:
-    """Residuals (S, k), jacobian (S, k, n) and bounds (n,) of a step from ``vector``: the cost with linear poses."""
-    matrix = problem.matrix(vector)
-    used = np.flatnonzero(objective.weights)
-    scale = np.array(objective.weights)[used]
-    residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
-    jacobian = (problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
-    jacobian = jacobian @ problem.parameterisation.slopes(vector)
-    return residuals, jacobian, problem.lower - vector, problem.upper - vector
