@@ -21,7 +21,6 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover import held_out as validating
 from omnibench.discover import result
-from omnibench.discover.covariate_dependence import covariate_dependences, without_smooth_term
 from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix, in_windows, without_effects
 from omnibench.discover.regressors.fine_structure import fine_structure
@@ -34,12 +33,14 @@ from omnibench.discover.selection.model_selection import (
     SURE,
     Screening,
     Selection,
+    covariate_dependences,
     screen_again,
     screen_extended,
     screen_plain,
     select_effects,
     select_motor_effects,
     significance_left,
+    without_smooth_term,
 )
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.environment import package_versions

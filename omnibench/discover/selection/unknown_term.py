@@ -25,13 +25,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting import Extended, Fit, columns_of, extend
 from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Group, Significance, best_shapes
 from omnibench.discover.selection.competing_models import CompetingModels
-from omnibench.discover.selection.model_selection import CHANCE, Screening
+from omnibench.discover.selection.model_selection import CHANCE, Screening, weights_of_covariates
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.effects.smooth import SmoothJoint
