@@ -151,11 +151,6 @@ class SquaresBothWays:
         """Mean side, m."""
         return float(np.mean([square.side for square in (*self.clockwise, *self.counter)]))
 
-    @property
-    def words(self) -> str:
-        """Numbers and side in words."""
-        return f"{len(self.clockwise)} clockwise and {len(self.counter)} counter-clockwise squares of {self.side:.2f} m"
-
     def solution(self, robot: Robot, wheelbase: float, diameters: float) -> Solution:
         """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left.
 
@@ -171,7 +166,8 @@ class SquaresBothWays:
         return Solution(
             corrected.inverse_kinematic_matrix.ravel(),
             f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
-            f"(E_d {diameters:.4f}), from {self.words}",
+            f"(E_d {diameters:.4f}), from {len(self.clockwise)} clockwise and {len(self.counter)} counter-clockwise "
+            f"squares of {self.side:.2f} m",
         )
 
 
@@ -182,10 +178,19 @@ def squares_both_ways(problem: CalibrationProblem) -> SquaresBothWays:
     """
     runs = [run for run in problem.trajectories if run.has_poses]
     stamps = [np.append(run.times[run.times < run.end], run.end) for run in runs]
-    model = OdometryModel.of_design(problem.robot, problem.integration)
+    robot, squares = problem.robot, list[Square]()
+    model = OdometryModel.of_design(robot, problem.integration)
     paths = model.poses([run.log(np.append(0.0, times)) for run, times in zip(runs, stamps, strict=True)])
-    driven = (_square(problem.robot, run, path) for run, path in zip(runs, paths, strict=True))
-    squares = [square for square in driven if square is not None]
+    for run, path in zip(runs, paths, strict=True):
+        odometry = poses_of_axle(robot, path)
+        odometry = relative(odometry[0], odometry)
+        driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(odometry[:, :2], axis=0).T)))
+        side, way = float(driven[-1] / 4), int(np.sign(odometry[-1, 2]))
+        corners = np.array([[1.0, 0.0], [1.0, way], [0.0, way], [0.0, 0.0]])
+        off = interpolated(side * np.arange(1, 5), driven, odometry[:, :2]) - side * corners
+        if np.hypot(*off.T).max() <= _OFF_CORNER * side and abs(abs(odometry[-1, 2]) - 2 * math.pi) <= _OFF_TURN:
+            truth = poses_of_axle(robot, run.poses[[0, -1]])
+            squares.append(Square(side, way, relative(truth[0], truth[1]) - odometry[-1]))
     clockwise = tuple(square for square in squares if square.way < 0)
     counter = tuple(square for square in squares if square.way > 0)
     if not clockwise or not counter:
@@ -193,20 +198,6 @@ def squares_both_ways(problem: CalibrationProblem) -> SquaresBothWays:
         which = f"{count}, none clockwise" if counter else f"{count}, none counter-clockwise" if clockwise else "none"
         raise NotApplicableError(f"it is for closed squares driven both ways from a corner (found: {which})")
     return SquaresBothWays(clockwise, counter)
-
-
-def _square(robot: Robot, run: Trajectory, path: Array) -> Square | None:
-    """A run as a square; None if its odometry (K, 3) from the start to the last reference pose is none."""
-    odometry = poses_of_axle(robot, path)
-    odometry = relative(odometry[0], odometry)
-    driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(odometry[:, :2], axis=0).T)))
-    side, way = driven[-1] / 4, int(np.sign(odometry[-1, 2]))
-    corners = np.array([[1.0, 0.0], [1.0, way], [0.0, way], [0.0, 0.0]])
-    off = interpolated(side * np.arange(1, 5), driven, odometry[:, :2]) - side * corners
-    if np.hypot(*off.T).max() > _OFF_CORNER * side or abs(abs(odometry[-1, 2]) - 2 * math.pi) > _OFF_TURN:
-        return None
-    truth = poses_of_axle(robot, run.poses[[0, -1]])
-    return Square(float(side), way, relative(truth[0], truth[1]) - odometry[-1])
 
 
 class SquaresMethod(TwoWheelMethod):

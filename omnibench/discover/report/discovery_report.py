@@ -87,7 +87,7 @@ def _cause(discovery: Discovery) -> tuple[str, str]:
         unnamed = " and of the gap an unnamed term closes what is shown" if discovery.extends else ""
         return discovery.verdict, f"{verdict}{unnamed}"
     first, *more = discovery.effects
-    others = [name for name in first.confusable_with if name != first.name]
+    others = first.confusable_with
     name = first.name.replace("_", " ")
     name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
     name += f", and {len(more)} more" if more else ""
@@ -132,9 +132,9 @@ def what_blocks(discovery: Discovery) -> Iterator[page.Block]:
 
 def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
     yield effect.physics
-    others = [name for name in effect.confusable_with if name != effect.name]
-    if others:
-        yield f"These data cannot tell it from {listing(others)}: any of them closes the gap as well."
+    if effect.confusable_with:
+        others = listing(list(effect.confusable_with))
+        yield f"These data cannot tell it from {others}: any of them closes the gap as well."
     if effect.in_doubt:
         yield f"In doubt: {effect.in_doubt}."
     if effect.source:

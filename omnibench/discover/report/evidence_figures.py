@@ -166,39 +166,22 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     for held in discovery.held_out:
         where = tables.held_out_in_words(discovery, held)
         gaps += [(where, held.eq6), (where, held.chi2)]
-    if not gaps:
-        gaps.append(("training runs", discovery.gap))
-    figures = tuple(
-        Figure(
-            _gap_title(discovery, gap, name),
-            _bars(
-                [
-                    _Bar(bar, 0.0, value, numbers.fixed(value, tables.gap_decimals(gap)), item)
-                    for bar, value, item in _gap_values(gap, discovery.extends)
-                ],
-                tables.METRICS[gap.metric],
-                1.25,
-            ),
-            f"{tables.METRICS[gap.metric]} on {name}: "
-            + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in _gap_values(gap, discovery.extends)),
-            190 if discovery.extends else 150,
-        )
-        for name, gap in gaps
-    )
-    line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps) else ()
+    figures = []
+    for name, gap in gaps or [("training runs", discovery.gap)]:
+        metric, values = tables.METRICS[gap.metric], _gap_values(gap, discovery.extends)
+        decimals = tables.gap_decimals(gap)
+        bars = [_Bar(bar, 0.0, value, numbers.fixed(value, decimals), item) for bar, value, item in values]
+        closed = f": {tables.closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
+        title = f"{metric}, {name}{closed if discovery.extends else ''}"
+        words = f"{metric} on {name}: " + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in values)
+        figures.append(Figure(title, _bars(bars, metric, 1.25), words, 190 if discovery.extends else 150))
+    line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps or [("", discovery.gap)]) else ()
     return FigureGrid(
-        figures,
+        tuple(figures),
         (*((fits.PLAIN, fits.EXTENDED) if discovery.extends else (fits.ALONE,)), *line),
         2 if len(figures) > 1 else 1,
         tables.floor_in_words(discovery),
     )
-
-
-def _gap_title(discovery: Discovery, gap: Gap, name: str) -> str:
-    title = f"{tables.METRICS[gap.metric]}, {name}"
-    if not discovery.extends:
-        return title
-    return f"{title}: {tables.closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
 
 
 def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem], ...]:

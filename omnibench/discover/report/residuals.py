@@ -255,13 +255,6 @@ def legend(styles: Sequence[ModelStyle], noise: bool = True) -> tuple[LegendItem
     return (*styles, NOISE) if noise else tuple(styles)
 
 
-def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
-    """The panels as plots, all with the same scale of y."""
-    limits = [_reach(panel) for panel in panels]
-    reach = 1.1 * max(limits, default=1.0) or 1.0
-    return [_plot(panel, reach) for panel in panels]
-
-
 def fitted_panels(
     residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
 ) -> list[Panel]:
@@ -297,10 +290,11 @@ def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "
     figures: list[Figure | None] = [None] * len(panels)
     for unit in dict.fromkeys(panel.unit for panel in panels):
         members = [index for index, panel in enumerate(panels) if panel.unit == unit]
-        for index, figure in zip(members, drawn([panels[index] for index in members]), strict=True):
+        reach = 1.1 * max(_reach(panels[index]) for index in members) or 1.0
+        for index in members:
             panel = panels[index]
             words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
-            figures[index] = Figure(panel.title, figure, words, _HEIGHT)
+            figures[index] = Figure(panel.title, _plot(panel, reach), words, _HEIGHT)
     caption = f"{caption} {_within_bands(panels)}".strip()
     found = tuple(figure for figure in figures if figure is not None)
     columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3

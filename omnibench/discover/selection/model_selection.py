@@ -542,26 +542,20 @@ def _forward_selection(
         best = odds.effect_sets(start, pool, len(chosen) + 1).best  # Eq. (4)
         if len(best) <= len(chosen):
             best = (*chosen, step.groups[step.best])
-            if not _explains_what_is_left(screening, chosen, best, rng):
+            # The larger set must take away most of what generic bases find after the smaller one: an idealised form
+            # leaves something, too, but hardly just what another effect makes.
+            (before, scatter), (after, _) = (
+                significance_of(
+                    screening.data, screening.index_with(groups), screening.groups.bases, rng
+                ).surplus_chi_square
+                for groups in (chosen, best)
+            )
+            if not (chosen and before > _CLEARLY * scatter and after < _MOSTLY * before):
                 break
         if not all(screening.confirms([other for other in best if other is not group], group) for group in best):
             break
         chosen = best
     return chosen, tuple(pool), tuple(steps)
-
-
-def _explains_what_is_left(
-    screening: Screening, chosen: Sequence[Group], larger: Sequence[Group], rng: np.random.Generator
-) -> bool:
-    """True if a larger set takes away most of what generic bases find after the smaller one.
-
-    An idealised form leaves something, too, but hardly just what another effect makes.
-    """
-    (before, scatter), (after, _) = (
-        significance_of(screening.data, screening.index_with(groups), screening.groups.bases, rng).surplus_chi_square
-        for groups in (chosen, larger)
-    )
-    return bool(chosen) and before > _CLEARLY * scatter and after < _MOSTLY * before
 
 
 def _probabilities(

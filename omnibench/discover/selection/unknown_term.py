@@ -118,23 +118,21 @@ def add_smooth_terms(
         trials += _of_families(screening, models.used, kinds) if covariates and not notes else ()
         best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
         if best is None or not is_gain(best.gains):
-            if not notes:
-                notes.append(_nothing_added(covariates, best))
+            if not covariates:
+                tried = "No unnamed term was tried: nothing that is left depends on what a model could use."
+            elif best is None:
+                names = " or ".join(covariates)
+                tried = f"No unnamed term was added: no function of {names} is plainly there by itself."
+            else:
+                words = best.words[0].upper() + best.words[1:]
+                tried = f"{words} was tried and left out: on motions held out it gains {best.gained}."
+            notes = notes or [tried]
             break
         weighted = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted)
         models = replace(models, used=weighted[0][1], weighted=weighted)
         notes.append(f"The extended model holds {best.words}: on motions held out it gains {best.gained}.")
         left = looking_again(models.used)
     return SmoothTerm(models, left, tuple(notes))
-
-
-def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
-    if not covariates:
-        return "No unnamed term was tried: nothing that is left depends on what a model could use."
-    if best is None:
-        return f"No unnamed term was added: no function of {' or '.join(covariates)} is plainly there by itself."
-    words = best.words[0].upper() + best.words[1:]
-    return f"{words} was tried and left out: on motions held out it gains {best.gained}."
 
 
 def _trials(
