@@ -159,21 +159,16 @@ class _Problem:
     def pruned(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
         """Counts without the runs that the wanted pairs can do without, the longest first."""
         while True:
-            fewer = np.array(list(self._with_fewer(counts)), dtype=np.intp).reshape(-1, len(counts))
-            if not len(fewer):
+            fewer = []
+            for index in np.flatnonzero(counts):
+                for left in (0, counts[index] - 1):
+                    if left == 0 or left >= _BATCHES[0]:
+                        fewer.append(counts.copy())
+                        fewer[-1][index] = left
+            cheapest = self._cheapest(np.array(fewer, dtype=np.intp).reshape(-1, len(counts)), wanted)
+            if cheapest is None:
                 return counts
-            enough = (self.sure(self.prospect(fewer)) | ~wanted).all(axis=(-2, -1))
-            if not enough.any():
-                return counts
-            counts = fewer[np.where(enough, self.cost(fewer), np.inf).argmin()]
-
-    def _with_fewer(self, counts: Counts) -> Iterator[Counts]:
-        for index in np.flatnonzero(counts):
-            for left in (0, counts[index] - 1):
-                if left == 0 or left >= _BATCHES[0]:
-                    fewer = counts.copy()
-                    fewer[index] = left
-                    yield fewer
+            counts = cheapest
 
     def exchanged(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
         """Counts with each command exchanged for runs of another one where that takes less time."""
@@ -185,12 +180,16 @@ class _Problem:
             others = np.concatenate([without + number * each for number in range(1, most)])
             often_enough = ((others == 0) | (others >= _BATCHES[0])).all(axis=1)
             others = others[often_enough & (self.cost(others) < self.cost(counts) - 1)]
-            if not len(others):
-                continue
-            enough = (self.sure(self.prospect(others)) | ~wanted).all(axis=(-2, -1))
-            if enough.any():
-                counts = others[np.where(enough, self.cost(others), np.inf).argmin()]
+            cheapest = self._cheapest(others, wanted)
+            counts = counts if cheapest is None else cheapest
         return counts
+
+    def _cheapest(self, options: Counts, wanted: NDArray[np.bool_]) -> Counts | None:
+        """The cheapest of some counts (n, C) that tell the wanted pairs apart; None if none of them does."""
+        if not len(options):
+            return None
+        enough = (self.sure(self.prospect(options)) | ~wanted).all(axis=(-2, -1))
+        return options[np.where(enough, self.cost(options), np.inf).argmin()] if enough.any() else None
 
 
 _DRAWS = 8  # draws of each member's values: half and twice as many change the minutes of omni3's plan by under 10 %
