@@ -609,7 +609,7 @@ def prove(
             nodes = [heapq.heappop(boxes)[2]]
             while boxes and len(nodes) < together and boxes[0][0] < enough and boxes[0][2].looseness.any():
                 nodes.append(heapq.heappop(boxes)[2])
-            if parts is not None:
+            if parts:
                 cuts = min(cuts, max((parts - count) // (2 * len(nodes)), 1))
             orders = [(bounds, node, enough, cuts) for node in nodes]
             for halves, made in gathered(backend, _branch, orders, shared=(bounds,)):
@@ -629,7 +629,7 @@ def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> tuple[l
     """
     bounds, node, enough, cuts = order
     boxes, made = [(node.bound, 0, node)], 0
-    while made < 2 * cuts and boxes[0][0] < enough and boxes[0][2].looseness.any():
+    while not made or (made < 2 * cuts and boxes[0][0] < enough and boxes[0][2].looseness.any()):
         for part in bounds.split(heapq.heappop(boxes)[2]):
             made += 1
             heapq.heappush(boxes, (part.bound, made, part))

@@ -19,6 +19,7 @@ each part of them.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -286,16 +287,14 @@ def degree_for(
     """
     if zeta.max(initial=0.0) > _LARGEST_ANGLE:
         return None, 0.0
-    half, power = zeta / 2, steps * (2.0**wheels * np.exp(zeta / 2))
-    degree = -1
-    while True:
-        degree += 1
-        if comb(degree + wheels, wheels) > _MOST_TERMS:
-            return None, 0.0
+    half, power, degree = zeta / 2, steps * (2.0**wheels * np.exp(zeta / 2)), 0
+    while comb(degree + wheels, wheels) <= _MOST_TERMS:
         power = power * half / (degree + 1)
         neglected = float(np.add.reduceat(power, firsts).max())
         if neglected <= tolerance:
             return degree, neglected
+        degree += 1
+    return None, 0.0
 
 
 def _bessel(angles: Array, degree: int) -> Array:
@@ -359,15 +358,14 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
         return None
     paths = [make_path(log, integration) for log in logs]
     row, speed = box.largest[2], box.speed
-    lengths = [float((np.abs(path.angles) @ speed).sum()) for path in paths]
-    length = max(1.0, *lengths)
+    steps_of = [np.abs(path.angles) @ speed for path in paths]
+    length = max(1.0, *(float(of_path.sum()) for of_path in steps_of))
     nodes = quadrature(paths, row, speed, _QUADRATURE * length, integration)
     if nodes is None:
         return None
     free = box.reach[2] > _NO_WIDTH * np.abs(box.centre[2]).max()
     wheels = int(free.sum())
-    steps = np.concatenate([np.abs(path.angles) @ speed for path in paths])
-    firsts = np.cumsum([0, *(len(path.angles) for path in paths[:-1])])
+    steps, firsts = np.concatenate(steps_of), np.cumsum([0, *map(len, steps_of[:-1])])
     cheapest, chosen = _SAMPLE * len(steps), None
     for limit in _LIMITS:
         segments = [cut(path, box.reach[2], limit) for path in paths]
@@ -411,11 +409,8 @@ def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
         residual = np.abs(scaled - (scaled @ used.T) @ used).sum(axis=1).reshape(rows, 2, components // 2)
         return float(np.hypot(residual[:, 0], residual[:, 1]).sum(axis=1).max())
 
-    low, high = 0, len(directions)
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if neglected(middle) <= plan.spare else (middle + 1, high)
-    return directions[:low].T, neglected(low) * max(len(anchors) for _, anchors in plan.segments)
+    fewest = bisect_left(range(len(directions)), True, key=lambda count: neglected(count) <= plan.spare)
+    return directions[:fewest].T, neglected(fewest) * max(len(anchors) for _, anchors in plan.segments)
 
 
 class PoseEvaluator:

@@ -63,8 +63,8 @@ class Genetic(Calibrator):
             mothers, fathers, singles = np.split(parents, [crossed, 2 * crossed])
             children = np.where(rng.random(mothers.shape) < 0.5, mothers, fathers)
             feasible = options.mutation == "adaptive_feasible"
-            mutated = (_feasibly_moved if feasible else _normally_moved)(singles, step, rng)
-            newcomers = np.concatenate([children, mutated])
+            moved = _moved(singles, step, rng) if feasible else singles + step * rng.standard_normal(singles.shape)
+            newcomers = np.concatenate([children, np.clip(moved, 0.0, 1.0)])
             survivors = np.argsort(scores, kind="stable")[:elite]
             people = np.concatenate([people[survivors], newcomers])
             scores = np.concatenate([scores[survivors], _scores(problem, newcomers)])
@@ -83,19 +83,15 @@ class Genetic(Calibrator):
         return Solution(problem.best_vector, f"{generations} generations", converged=False)
 
 
-def _feasibly_moved(parents: Array, step: float, rng: np.random.Generator) -> Array:
-    """Points (P, f) after steps in random directions that stay in the unit cube."""
+def _moved(parents: Array, step: float, rng: np.random.Generator) -> Array:
+    """Points (P, f) after steps in random directions that stay in the unit cube, up to rounding."""
     directions = rng.standard_normal(parents.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         room = np.where(directions > 0, (1 - parents) / directions, -parents / directions)
     longest = np.nanmin(np.where(directions == 0, np.inf, room), axis=1, keepdims=True)
-    return np.clip(parents + directions * np.minimum(step, longest), 0.0, 1.0)
-
-
-def _normally_moved(parents: Array, step: float, rng: np.random.Generator) -> Array:
-    """Points (P, f) after normal steps of every element, clipped to the unit cube."""
-    return np.clip(parents + step * rng.standard_normal(parents.shape), 0.0, 1.0)
+    moved: Array = parents + directions * np.minimum(step, longest)
+    return moved
 
 
 def _scores(problem: CalibrationProblem, points: Array) -> Array:
