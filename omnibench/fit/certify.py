@@ -325,9 +325,7 @@ class LowerBounds:
             raise ConfigError(f"a lower bound needs a cost that is a sum of norms, which {objective.name} is not")
         odometry = problem.odometry
         if not isinstance(odometry, OdometryBatch):
-            raise ConfigError(
-                "no lower bound is known for runs with references other than poses: nothing can be certified"
-            )
+            raise ConfigError("a lower bound needs reference poses alone: of other references none is known")
         self._design = problem.start.reshape(3, -1)
         # Orthonormal directions (r, N) of wheel rates across the null ones, the unit vectors if there are none.
         null, unit = parameterisation.null, np.eye(self._design.shape[1])
