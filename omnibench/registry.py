@@ -40,7 +40,7 @@ _MOVED = {
     "omnibench.data.clock_matching": ("data.alignment",),
     "omnibench.data.importers.tum": ("data.importers.orientation",),
     "omnibench.data.recording": ("data.importers.recording_options", "data.importers.robot_option"),
-    "omnibench.fit.differential": ("fit.differential.axle", "fit.differential.driven_squares"),
+    "omnibench.fit.article_methods": ("fit.differential", "fit.differential.axle", "fit.differential.driven_squares"),
     "omnibench.fit.motion_windows": ("fit.observations.motion_windows",),
     "omnibench.fit.shrinkage": ("fit.shrinkage.shrunk_matrix",),
     "omnibench.fit.uncertainty": ("fit.uncertainty.uncertainty",),
