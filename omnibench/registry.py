@@ -42,7 +42,7 @@ _MOVED = {
     "omnibench.data.recording": ("data.importers.recording_options", "data.importers.robot_option"),
     "omnibench.fit.article_methods": ("fit.differential", "fit.differential.axle", "fit.differential.driven_squares"),
     "omnibench.fit.motion_windows": ("fit.observations.motion_windows",),
-    "omnibench.fit.shrinkage": ("fit.shrinkage.shrunk_matrix",),
+    "omnibench.fit.calibrators.closed_form": ("fit.shrinkage.shrunk_matrix",),
     "omnibench.fit.uncertainty": ("fit.uncertainty.uncertainty",),
     "omnibench.robot.corrections": ("robot.domain.fade", "robot.domain.training_domain"),
     "omnibench.robot.effects.effect": ("robot.effects.weights",),

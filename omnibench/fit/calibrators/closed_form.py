@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.calibrator import Calibrator, RunResult, Solution, run_calibrator
 from omnibench.fit.linear_fit import linear_fit, minimum_in_turn, reweighted_minimum
 from omnibench.fit.loss import Loss, RobustCost, beginning_with_huber, norms_of
 from omnibench.fit.problem import CalibrationProblem
@@ -115,3 +115,13 @@ class ClosedForm(Calibrator):
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {work}")
         return Solution(vector, f"step still {moved:.1e} after {work}", converged=False)
+
+
+def closed_form_result(problem: CalibrationProblem) -> RunResult:
+    """The result of closed_form on a problem, which plug-ins that add effects to a matrix begin with."""
+    return run_calibrator(calibrators.create("closed_form"), problem)
+
+
+def shrunk_closed_form(problem: CalibrationProblem) -> tuple[RunResult, RunResult]:
+    """Twice the result of closed_form, which is no longer shrunk to the design: what earlier plug-ins ask for."""
+    return closed_form_result(problem), closed_form_result(problem)
