@@ -8,11 +8,11 @@ from importlib import import_module
 from itertools import groupby
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Json, Plugins, load_given_plugins, output_option
+from omnibench.cli.options import Force, Json, Plugins, argument, load_given_plugins, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
@@ -32,7 +32,7 @@ _NAMES = _NAME_WIDTH + 4  # columns, with the spaces around it
 
 @guide_app.command()
 def guide(
-    topic: Annotated[str | None, typer.Argument(help="What to read about. Default: the list of topics.")] = None,
+    topic: str | None = argument("What to read about. Default: the list of topics."),
 ) -> None:
     """Show the handbook: a topic, or the list of topics."""
     from omnibench.cli.handbook_topics import find_topic, topics
@@ -61,8 +61,8 @@ def guide(
 
 @guide_app.command()
 def example(
-    name: Annotated[str | None, typer.Argument(help="One of the list that is shown without it.")] = None,
-    output: Annotated[Path | None, output_option("Folder to write to.", metavar="DIR")] = None,
+    name: str | None = argument("One of the list that is shown without it."),
+    output: Path | None = output_option("Folder to write to.", metavar="DIR"),
     force: Force = False,
 ) -> None:
     """Write an example to begin with, or list the examples.
@@ -152,9 +152,9 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
 
 @guide_app.command()
 def schema(
-    kind: Annotated[
-        Literal["compare", "design", "live", "simulate", "study"], typer.Argument(help="Which command's config.")
-    ] = "compare",
+    kind: Literal["compare", "design", "live", "simulate", "study"] = argument(
+        "Which command's config.", default="compare"
+    ),
 ) -> None:
     """Print the JSON schema of a config, for editors."""
     module, name = _CONFIGS[kind]
@@ -165,14 +165,10 @@ def schema(
 
 @_plugin.command("new")
 def plugin_new(
-    name: Annotated[str, typer.Argument(help="Name of the plug-in in configs.")],
-    kind: Annotated[
-        str | None, typer.Option(metavar="KIND", help="calibrator, importer, cost or effect. Default: calibrator.")
-    ] = None,
-    effect: Annotated[bool, typer.Option("--effect", help="Short for --kind effect.")] = False,
-    folder: Annotated[
-        Path, typer.Option("--folder", "-o", "--output", metavar="DIR", help="Folder to write to.")
-    ] = Path("plugins"),
+    name: str = argument("Name of the plug-in in configs.", default=...),
+    kind: str | None = option("calibrator, importer, cost or effect. Default: calibrator.", metavar="KIND"),
+    effect: bool = option("Short for --kind effect.", "--effect", default=False),
+    folder: Path = option("Folder to write to.", "--folder", "-o", "--output", default=Path("plugins"), metavar="DIR"),
     force: Force = False,
 ) -> None:
     """Write a working plug-in and its test."""
@@ -189,9 +185,9 @@ def plugin_new(
 
 @_plugin.command("check")
 def plugin_check(
-    file: Annotated[Path, typer.Argument(help="Plug-in file.")],
-    sample: Annotated[Path | None, typer.Option(help="Sample recordings for an importer to read.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Longest time of the whole check, in s.")] = 600.0,
+    file: Path = argument("Plug-in file.", default=...),
+    sample: Path | None = option("Sample recordings for an importer to read."),
+    seconds: float = option("Longest time of the whole check, in s.", default=600.0, min=0.1),
 ) -> None:
     """Run the conformance tests on a plug-in.
 

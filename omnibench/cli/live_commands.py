@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
+from omnibench.cli.options import Force, Plugins, argument, load_given_plugins, option, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
@@ -36,18 +36,13 @@ Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after this ti
 
 @live_app.command()
 def live(
-    config: Annotated[Path, typer.Argument(help="Config of the node (YAML).")],
-    dataset: Annotated[
-        Path | None,
-        typer.Argument(help="With --replay: data set folder, or config with a simulated one. Default: the config's."),
-    ] = None,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Play a recording to the node, show its errors, and end.")
-    ] = False,
-    speed: Annotated[
-        str | None, typer.Option(help="Speed of the replay: 1, 10, ... or max. Default: the config's.")
-    ] = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on this computer.")] = False,
+    config: Path = argument("Config of the node (YAML).", default=...),
+    dataset: Path | None = argument(
+        "With --replay: data set folder, or config with a simulated one. Default: the config's."
+    ),
+    replay: bool = option("Play a recording to the node, show its errors, and end.", "--replay", default=False),
+    speed: str | None = option("Speed of the replay: 1, 10, ... or max. Default: the config's."),
+    foxglove: bool = option("Serve Foxglove's WebSocket on this computer.", "--foxglove", default=False),
     seconds: Seconds = None,
     plugins: Plugins = None,
 ) -> None:
@@ -120,18 +115,13 @@ def _replay_to_node(
 
 @live_app.command()
 def replay(
-    dataset: Annotated[Path, typer.Argument(help="Data set folder, or config with a simulated one.")],
-    robot: Annotated[str, typer.Option(help="Name of the robot that is played.")] = "robot",
-    speed: Annotated[str, typer.Option(help="1: as recorded; 10: ten times as fast; max: as fast as can be.")] = "1",
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Set what a node's config holds under replay; may be repeated."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration whose noise model gives the covariance of the SLAM poses.")
-    ] = None,
+    dataset: Path = argument("Data set folder, or config with a simulated one.", default=...),
+    robot: str = option("Name of the robot that is played.", default="robot"),
+    speed: str = option("1: as recorded; 10: ten times as fast; max: as fast as can be.", default="1"),
+    settings: list[str] | None = option(
+        "Set what a node's config holds under replay; may be repeated.", "--set", metavar="KEY=VALUE"
+    ),
+    calibration: Path | None = option("Calibration whose noise model gives the covariance of the SLAM poses."),
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
@@ -172,12 +162,12 @@ def replay(
 
 @live_app.command()
 def listen(
-    robot: Annotated[str | None, typer.Argument(help="Name of the robot. Default: all that are heard.")] = None,
+    robot: str | None = argument("Name of the robot. Default: all that are heard."),
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
     seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document a line, once a second.")] = False,
+    as_json: bool = option("Print one JSON document a line, once a second.", "--json", default=False),
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
     from omnibench.cli.terminal.live_tables import listen as show
@@ -193,8 +183,8 @@ def listen(
 
 @live_app.command()
 def swap(
-    robot: Annotated[str, typer.Argument(help="Name of the robot.")],
-    calibration: Annotated[Path, typer.Argument(help="Calibration file to run from now on.")],
+    robot: str = argument("Name of the robot.", default=...),
+    calibration: Path = argument("Calibration file to run from now on.", default=...),
     config: ConfigOption = None,
     connect: Connect = None,
     plugins: Plugins = None,
@@ -215,18 +205,15 @@ def swap(
 
 @live_app.command()
 def record(
-    robots: Annotated[
-        list[str],
-        typer.Argument(metavar="ROBOT...|CONFIG", help="Names of robots, or the config of a node with them."),
-    ],
-    output: Annotated[Path, output_option("MCAP file to write.", metavar="FILE.mcap")],
+    robots: list[str] = argument(
+        "Names of robots, or the config of a node with them.", default=..., metavar="ROBOT...|CONFIG"
+    ),
+    output: Path = output_option("MCAP file to write.", default=..., metavar="FILE.mcap"),
     config: ConfigOption = None,
     connect: Connect = None,
     profile: ProfileOption = None,
     seconds: Seconds = None,
-    topics: Annotated[
-        list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated. Default: all.")
-    ] = None,
+    topics: list[str] | None = option("Record only this topic; may be repeated. Default: all.", "--topic"),
     force: Force = False,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
@@ -248,21 +235,17 @@ def record(
 
 @live_app.command()
 def keys(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
-    names: Annotated[list[str] | None, typer.Argument(help="Who gets a certificate. Default: node and client.")] = None,
-    router: Annotated[
-        str | None,
-        typer.Option(help="Who of these runs the node that the others connect to. Default: node.", metavar="NAME"),
-    ] = None,
-    hosts: Annotated[
-        list[str] | None,
-        typer.Option("--host", help="Name or address of the computer that this node runs on; may be repeated."),
-    ] = None,
-    days: Annotated[int, typer.Option(min=1, help="Validity, in days.")] = 365,
-    users: Annotated[bool, typer.Option("--users", help="Also make passwords, and a users.txt for the node.")] = False,
-    force: Annotated[
-        bool, typer.Option("--force", "--overwrite", help="Replace files that exist, the authority (CA) too.")
-    ] = False,
+    folder: Path = argument("Folder to write to.", default=..., metavar="DIR"),
+    names: list[str] | None = argument("Who gets a certificate. Default: node and client."),
+    router: str | None = option(
+        "Who of these runs the node that the others connect to. Default: node.", metavar="NAME"
+    ),
+    hosts: list[str] | None = option(
+        "Name or address of the computer that this node runs on; may be repeated.", "--host"
+    ),
+    days: int = option("Validity, in days.", default=365, min=1),
+    users: bool = option("Also make passwords, and a users.txt for the node.", "--users", default=False),
+    force: bool = option("Replace files that exist, the authority (CA) too.", "--force", "--overwrite", default=False),
 ) -> None:
     """Make a test authority (CA) and certificates for mutual TLS."""
     from omnibench.live.network.keys import make_keys

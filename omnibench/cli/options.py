@@ -11,8 +11,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -31,9 +33,45 @@ if TYPE_CHECKING:
     from omnibench.report.blocks import Document
 
 
+def option(text: str, *names: str, default: Any = None, **settings: Any) -> Any:
+    """An option of a command, as the default of its parameter. text: its help. default: ``...`` if it must be given."""
+    return typer.Option(default, *names, help=text, **settings)
+
+
+def argument(text: str, default: Any = None, **settings: Any) -> Any:
+    """An argument of a command, as the default of its parameter. text, default: as of an option."""
+    return typer.Argument(default, help=text, **settings)
+
+
 def output_option(text: str, **settings: Any) -> Any:
     """``-o`` and ``--output``: the same two spellings for every command that writes files."""
-    return typer.Option("-o", "--output", help=text, **settings)
+    return option(text, "-o", "--output", **settings)
+
+
+def grouped(function: Callable[..., None]) -> Callable[..., None]:
+    """A command's function, in which a parameter that is by default a group of options stands for all of these.
+
+    A group is a dataclass whose fields are options; the function gets one with the values that were given.
+    """
+    groups, parameters = dict[str, Any](), list[inspect.Parameter]()
+    for parameter in inspect.signature(function).parameters.values():
+        if not is_dataclass(group := parameter.default):
+            parameters.append(parameter)
+            continue
+        groups[parameter.name], types = group, get_type_hints(type(group), include_extras=True)
+        for field in fields(group):
+            default = getattr(group, field.name)
+            parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
+
+    @wraps(function)
+    def command(*arguments: Any, **given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = replace(group, **{field.name: given.pop(field.name) for field in fields(group)})
+        function(*arguments, **given)
+
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
 
 
 DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
@@ -68,92 +106,103 @@ Plugins = Annotated[
     ),
 ]
 
-
-# Modules that jobs which read a data set share.
-_READING = ("omnibench.check.streams", "omnibench.check.clocks", "omnibench.robot.compiled_beforehand")
-BackendName = Annotated[
-    str | None,
-    typer.Option(
-        "--backend",
-        metavar="NAME",
-        help="Where many jobs are run: processes; dask (a cluster started here); tcp://HOST:PORT or tls://HOST:PORT, "
-        "a scheduler of Dask.",
-    ),
-]
-TlsAuthority = Annotated[
-    Path | None, typer.Option("--tls-ca", metavar="FILE", help="For tls://: the authority's certificate.")
-]
-TlsCertificate = Annotated[
-    Path | None, typer.Option("--tls-cert", metavar="FILE", help="For tls://: this client's certificate.")
-]
-Workers = Annotated[
-    int | None, typer.Option(min=1, help="For --backend: processes, or Dask workers started here. Default: processors.")
-]
-TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="For tls://: this client's key.")]
 PluginFiles = Annotated[
     list[Path] | None,
     typer.Option("--plugin", metavar="FILE", help="One plug-in file to load; may be repeated."),
 ]
 
 
-def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles | None:
-    """The files of the options; None without any. ConfigError: some are given, not all."""
-    if ca is None and cert is None and key is None:
-        return None
-    if ca is None or cert is None or key is None:
-        raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
-    from omnibench.jobs.job import TlsFiles
-
-    return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
+# Modules that jobs which read a data set share.
+_READING = ("omnibench.check.streams", "omnibench.check.clocks", "omnibench.robot.compiled_beforehand")
 
 
-@contextmanager
-def asked_backend(
-    name: str | None, workers: int | None, tls: TlsFiles | None, preload: Sequence[str], report: Reporter
-) -> Iterator[Backend | None]:
-    """The backend of ``--backend``, open in the block; None where none was given: this process does the work.
+@dataclass(frozen=True)
+class BackendOptions:
+    """Options that say where many jobs are run: by default in this process."""
 
-    In the block its workers read data sets larger than memory, of which ``report`` is told.
-    """
-    from omnibench.progress import reading_told_to
+    backend: str | None = option(
+        "Where many jobs are run: processes; dask (a cluster started here); tcp://HOST:PORT or tls://HOST:PORT, "
+        "a scheduler of Dask.",
+        metavar="NAME",
+    )
+    workers: int | None = option("For --backend: processes, or Dask workers started here. Default: processors.", min=1)
+    tls_ca: Path | None = option("For tls://: the authority's certificate.", metavar="FILE")
+    tls_cert: Path | None = option("For tls://: this client's certificate.", metavar="FILE")
+    tls_key: Path | None = option("For tls://: this client's key.", metavar="FILE")
 
-    if name is None:
-        if workers is not None or tls is not None:
-            raise ConfigError("--workers and the files of TLS are for --backend; name one")
-        with reading_told_to(report):
-            yield None
-        return
-    from omnibench.jobs.backend_choice import BackendChoice, open_backend
-    from omnibench.robot.stored_odometry import read_by
+    @property
+    def tls(self) -> TlsFiles | None:
+        """The files of the options; None without any. ConfigError: some are given, not all."""
+        ca, cert, key = self.tls_ca, self.tls_cert, self.tls_key
+        if ca is None and cert is None and key is None:
+            return None
+        if ca is None or cert is None or key is None:
+            raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
+        from omnibench.jobs.job import TlsFiles
 
-    choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
-    with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
-        yield backend
+        return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
+
+    @contextmanager
+    def opened(self, report: Reporter, *preload: str) -> Iterator[Backend | None]:
+        """The backend, open in the block; None where none was given: this process does the work.
+
+        In the block its workers read data sets larger than memory, of which ``report`` is told. preload: modules that
+        all jobs import.
+        """
+        from omnibench.progress import reading_told_to
+
+        tls = self.tls
+        if self.backend is None:
+            if self.workers is not None or tls is not None:
+                raise ConfigError("--workers and the files of TLS are for --backend; name one")
+            with reading_told_to(report):
+                yield None
+            return
+        from omnibench.jobs.backend_choice import BackendChoice, open_backend
+        from omnibench.robot.stored_odometry import read_by
+
+        choice = BackendChoice(name=self.backend, workers=self.workers or os.cpu_count() or 1, tls=tls)
+        with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
+            yield backend
 
 
-def refuse_report(report: Path | None, figures: Path | None, *, force: bool) -> None:
-    """Before the work begins: ConfigError if the page of ``--report`` is there, DataError if no figure can be drawn."""
-    refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of the commands that write a page on request."""
+
+    report: Path | None = option("Write a page with figures.", metavar="FILE.html")
+    figures: Figures = None
+
+    @property
+    def asked(self) -> bool:
+        """True if either is asked for."""
+        return self.report is not None or self.figures is not None
+
+    def refuse(self, *, force: bool) -> None:
+        """Before the work begins: ConfigError if the page is there, DataError if no figure can be drawn."""
+        refuse_existing(self.report, force=force)
+        refuse_figures_without_browser(self.figures)
+
+    def write(self, page: Callable[[], Document], *, announced: bool = False) -> None:
+        """Write the page and its figures; it is made only where either is asked for.
+
+        announced: say on standard error where the page is.
+        """
+        if not self.asked:
+            return
+        from omnibench.report.render import write_document
+
+        document = page()
+        if self.report is not None:
+            write_document(document, self.report)
+            if announced:
+                typer.echo(f"report: {self.report}", err=True)
+        write_asked_figures(document, self.figures)
 
 
-def write_asked_report(
-    page: Callable[[], Document], report: Path | None, figures: Path | None, *, announced: bool = False
-) -> None:
-    """Write the page of ``--report`` and the figures of ``--figures``; it is made only where either is asked for.
-
-    announced: say on standard error where the page is.
-    """
-    if report is None and figures is None:
-        return
-    from omnibench.report.render import write_document
-
-    document = page()
-    if report is not None:
-        write_document(document, report)
-        if announced:
-            typer.echo(f"report: {report}", err=True)
-    write_asked_figures(document, figures)
+def report_options(text: str) -> ReportOptions:
+    """The options ``--report``, of which ``text`` is the help, and ``--figures``."""
+    return ReportOptions(report=option(text, metavar="FILE.html"))
 
 
 def refuse_figures_without_browser(folder: Path | None) -> None:
@@ -170,12 +219,8 @@ def write_asked_figures(document: Document, folder: Path | None) -> None:
         from omnibench.report.figure_files import write_figures
 
         names = write_figures(document, folder)
-        what = (
-            f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)"
-            if names
-            else "none in the report"
-        )
-        typer.echo(f"figures: {what}", err=True)
+        shown = f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)" if names else ""
+        typer.echo(f"figures: {shown or 'none in the report'}", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:

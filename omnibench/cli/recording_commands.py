@@ -4,13 +4,14 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 from typer.core import TyperCommand
 
 import omnibench
 from omnibench.cli import options as shared
+from omnibench.cli.options import argument, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -50,31 +51,25 @@ def _paths(given: Any) -> list[Path] | None:
 
 @recording_app.command("import", cls=HelpOfImporters)
 def import_(
-    importer: Annotated[
-        str,
-        typer.Argument(metavar="FORMAT", help="Format of the recordings; import FORMAT --help shows its options."),
-    ],
-    source: Annotated[Path | None, typer.Argument(help="File or folder with the recordings.")] = None,
-    output: Annotated[Path | None, shared.output_option("Data set folder to write.")] = None,
+    importer: str = argument(
+        "Format of the recordings; import FORMAT --help shows its options.", default=..., metavar="FORMAT"
+    ),
+    source: Path | None = argument("File or folder with the recordings."),
+    output: Path | None = output_option("Data set folder to write."),
     settings: shared.Settings = None,
-    accept_units: Annotated[
-        bool, typer.Option("--accept-units", help="Write the data set even if units look wrong by magnitude.")
-    ] = False,
-    template: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="csv, without SOURCE: write tables and robot.yaml to fill in."),
-    ] = None,
-    robot_type: Annotated[
-        Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None,
-        typer.Option(help="With --template: the robot's type. Default: diff."),
-    ] = None,
-    references: Annotated[
-        bool,
-        typer.Option(
-            "--references", help="With --template: distances and turned angles, measured by hand, instead of poses."
-        ),
-    ] = False,
-    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the check of what was recorded.")] = False,
+    accept_units: bool = option(
+        "Write the data set even if units look wrong by magnitude.", "--accept-units", default=False
+    ),
+    template: Path | None = option("csv, without SOURCE: write tables and robot.yaml to fill in.", metavar="DIR"),
+    robot_type: Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None = option(
+        "With --template: the robot's type. Default: diff."
+    ),
+    references: bool = option(
+        "With --template: distances and turned angles, measured by hand, instead of poses.",
+        "--references",
+        default=False,
+    ),
+    no_check: bool = option("Leave out the check of what was recorded.", "--no-check", default=False),
     table_format: shared.TableFormat = "parquet",
     force: shared.Force = False,
     plugins: shared.Plugins = None,
@@ -170,18 +165,11 @@ _NAMES = 12  # columns of the list's names, with the spaces around them
 
 @recording_app.command()
 def fetch(
-    name: Annotated[
-        str | None,
-        typer.Argument(help="One of the list that is shown without it, or any OWNER/REPO on GitHub."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        shared.output_option("Data set folder to write; of several data sets, the folder above. Default: data/NAME."),
-    ] = None,
-    commit: Annotated[
-        str | None,
-        typer.Option(metavar="SHA", help="Commit to take; HEAD: the newest. Default: the one that was tested."),
-    ] = None,
+    name: str | None = argument("One of the list that is shown without it, or any OWNER/REPO on GitHub."),
+    output: Path | None = output_option(
+        "Data set folder to write; of several data sets, the folder above. Default: data/NAME."
+    ),
+    commit: str | None = option("Commit to take; HEAD: the newest. Default: the one that was tested.", metavar="SHA"),
     force: shared.Force = False,
 ) -> None:
     """Clone a public recording from GitHub and import it.
@@ -228,33 +216,17 @@ def fetch(
 
 
 @recording_app.command()
+@shared.grouped
 def check(
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Data set folder, or several; folder or file of CSV tables, or a bag.", metavar="SOURCE..."
-        ),
-    ],
-    importer: Annotated[
-        str | None,
-        typer.Option("--format", metavar="NAME", help="Importer of the source. Default: by its files."),
-    ] = None,
-    robot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="robot.yaml, where the source does not say the robot.")
-    ] = None,
+    source: list[Path] = argument(
+        "Data set folder, or several; folder or file of CSV tables, or a bag.", default=..., metavar="SOURCE..."
+    ),
+    importer: str | None = option("Importer of the source. Default: by its files.", "--format", metavar="NAME"),
+    robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
     settings: shared.Settings = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
-    ] = None,
-    figures: shared.Figures = None,
-    plugin: Annotated[
-        list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
-    ] = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of clocks and findings."),
+    plugin: list[Path] | None = option("A plug-in with an importer; may be repeated.", "--plugin", metavar="FILE"),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
     force: shared.Force = False,
     as_json: shared.Json = False,
 ) -> None:
@@ -266,19 +238,18 @@ def check(
     from omnibench.check.source import next_command, read_source
     from omnibench.config import parse_settings
 
-    shared.refuse_report(report, figures, force=force)
+    page.refuse(force=force)
     shared.load_given_plugins([Path("none")], plugin)
-    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
+    with ProgressDisplay() as watch, jobs.opened(watch):
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
 
-    def page() -> "Document":
+    def document() -> "Document":
         from omnibench.report.recording.inspection_report import check_document
 
         return check_document(read.dataset, checked)
 
-    shared.write_asked_report(page, report, figures, announced=True)
+    page.write(document, announced=True)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
@@ -327,18 +298,13 @@ def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> 
 
 
 @recording_app.command()
+@shared.grouped
 def inspect(
     dataset: shared.DatasetFolders,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
-    ] = None,
-    figures: shared.Figures = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
+    page: shared.ReportOptions = shared.report_options(
+        "Write a page: paths, motions driven, wheel rates, runs step by step."
+    ),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
     force: shared.Force = False,
     as_json: shared.Json = False,
 ) -> None:
@@ -346,12 +312,11 @@ def inspect(
     from omnibench.cli.terminal.inspection_summary import print_inspection
     from omnibench.report.recording.inspection_report import inspection_document
 
-    shared.refuse_report(report, figures, force=force)
-    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
+    page.refuse(force=force)
+    with ProgressDisplay() as watch, jobs.opened(watch):
         recordings = omnibench.load_dataset(dataset)
         inspection = omnibench.inspect_dataset(recordings)
-    shared.write_asked_report(lambda: inspection_document(recordings, inspection), report, figures, announced=True)
+    page.write(lambda: inspection_document(recordings, inspection), announced=True)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
@@ -368,56 +333,32 @@ def inspect(
 
 @recording_app.command()
 def design(
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATASET|CONFIG", help="Data set folder, or config of a comparison or a design."),
-    ] = None,
-    use: Annotated[
-        Literal["trajectory", "final"],
-        typer.Option(help="Reference poses to calibrate from: all of a run's, or only its final one."),
-    ] = "trajectory",
-    per: Annotated[
-        Literal["run", "second", "metre"], typer.Option(help="Effort to keep small: runs, time or distance.")
-    ] = "run",
-    runs: Annotated[
-        int | None, typer.Option(min=1, help="Runs to choose. Default: the fewest within 1 % of the optimum.")
-    ] = None,
-    repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen at most.")] = None,
+    source: Path | None = argument("Data set folder, or config of a comparison or a design.", metavar="DATASET|CONFIG"),
+    use: Literal["trajectory", "final"] = option(
+        "Reference poses to calibrate from: all of a run's, or only its final one.", default="trajectory"
+    ),
+    per: Literal["run", "second", "metre"] = option("Effort to keep small: runs, time or distance.", default="run"),
+    runs: int | None = option("Runs to choose. Default: the fewest within 1 % of the optimum.", min=1),
+    repetitions: int | None = option("How often a command may be chosen at most.", min=1),
     dataset: shared.WhichDataset = None,
-    integration: Annotated[
-        Literal["euler", "arc"] | None,
-        typer.Option(help="Path within a sample; see calibrate. Default: the config's, or arc for a data set."),
-    ] = None,
-    robot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."),
-    ] = None,
-    max_speed: Annotated[
-        float | None, typer.Option(help="With --robot: its greatest speed, m/s. Default: 0.5.")
-    ] = None,
-    max_turn_rate: Annotated[
-        float | None, typer.Option(help="With --robot: its fastest turn, rad/s. Default: 1.")
-    ] = None,
-    max_wheel_rate: Annotated[
-        float | None,
-        typer.Option(help="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."),
-    ] = None,
-    steering_limit: Annotated[
-        float | None,
-        typer.Option(help="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."),
-    ] = None,
-    area: Annotated[
-        str | None, typer.Option(metavar="AxB", help="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
-    ] = None,
-    position_noise: Annotated[
-        float | None, typer.Option(help="With --robot: of the reference's positions, m. Default: 0.005.")
-    ] = None,
-    heading_noise: Annotated[
-        float | None, typer.Option(help="With --robot: of the reference's headings, deg. Default: 0.3.")
-    ] = None,
-    output: Annotated[
-        Path | None, shared.output_option("Folder for report.html and design.json. Default: nothing is written.")
-    ] = None,
+    integration: Literal["euler", "arc"] | None = option(
+        "Path within a sample; see calibrate. Default: the config's, or arc for a data set."
+    ),
+    robot: Path | None = option(
+        "Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml).", metavar="FILE"
+    ),
+    max_speed: float | None = option("With --robot: its greatest speed, m/s. Default: 0.5."),
+    max_turn_rate: float | None = option("With --robot: its fastest turn, rad/s. Default: 1."),
+    max_wheel_rate: float | None = option(
+        "With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
+    ),
+    steering_limit: float | None = option(
+        "With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
+    ),
+    area: str | None = option("With --robot: free floor, m, like 3x2.5. Default: 3x3.", metavar="AxB"),
+    position_noise: float | None = option("With --robot: of the reference's positions, m. Default: 0.005."),
+    heading_noise: float | None = option("With --robot: of the reference's headings, deg. Default: 0.3."),
+    output: Path | None = output_option("Folder for report.html and design.json. Default: nothing is written."),
     figures: shared.Figures = None,
     force: shared.Force = False,
     plugins: shared.Plugins = None,
@@ -463,28 +404,17 @@ def design(
 
 
 @recording_app.command()
+@shared.grouped
 def slam(
-    dataset: Annotated[Path, typer.Argument(help="Data set folder with laser scans.")],
-    output: Annotated[Path | None, shared.output_option("Data set folder to write, with the new poses.")] = None,
-    start: Annotated[
-        Literal["odometry", "last_pose"] | None,
-        typer.Option(help="First guess of each scan's pose. Default: odometry."),
-    ] = None,
-    no_deskew: Annotated[
-        bool, typer.Option("--no-deskew", help="Leave out the correction for the robot's motion during a scan.")
-    ] = False,
-    model: Annotated[
-        Path | None,
-        typer.Option(metavar="CALIBRATION", help="Calibration for that odometry. Default: the design values."),
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder that simulate --truth wrote: show the errors against it."),
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of scans, paths and wheels.")
-    ] = None,
-    figures: shared.Figures = None,
+    dataset: Path = argument("Data set folder with laser scans.", default=...),
+    output: Path | None = output_option("Data set folder to write, with the new poses."),
+    start: Literal["odometry", "last_pose"] | None = option("First guess of each scan's pose. Default: odometry."),
+    no_deskew: bool = option(
+        "Leave out the correction for the robot's motion during a scan.", "--no-deskew", default=False
+    ),
+    model: Path | None = option("Calibration for that odometry. Default: the design values.", metavar="CALIBRATION"),
+    truth: Path | None = option("Folder that simulate --truth wrote: show the errors against it.", metavar="DIR"),
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of scans, paths and wheels."),
     settings: shared.Settings = None,
     table_format: shared.TableFormat = "parquet",
     force: shared.Force = False,
@@ -506,24 +436,24 @@ def slam(
     request = SlamRequest(
         dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
-    shared.refuse_report(report, figures, force=force)
-    if output is None and report is None and figures is None and not as_json:
+    page.refuse(force=force)
+    if output is None and not page.asked and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
         result = request.run(watch, table_format)
 
-        def page() -> "Document":
+        def document() -> "Document":
             from omnibench.report.recording.section import recording_document
 
             watch(Progress("writing the report"))
             return recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
 
-        shared.write_asked_report(page, report, figures)
+        page.write(document)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
     print_slam(make_console(), result.summary)
-    for what, file in (("report", report), (plural(result.summary.runs, "trajectory"), output)):
+    for what, file in (("report", page.report), (plural(result.summary.runs, "trajectory"), output)):
         if file is not None:
             typer.echo(f"{what}: {file}")
     poses = f"{plural(result.summary.scans, 'scan')} gave poses"
@@ -533,34 +463,23 @@ def slam(
 
 
 @recording_app.command()
+@shared.grouped
 def simulate(
-    output: Annotated[Path, shared.output_option("Data set folder to write.")],
-    config: Annotated[Path | None, typer.Argument(help="Config with a simulated data set.")] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the truth: matrix, effects, true poses. Default: not written."),
-    ] = None,
+    output: Path = output_option("Data set folder to write.", default=...),
+    config: Path | None = argument("Config with a simulated data set."),
+    truth: Path | None = option(
+        "Folder for the truth: matrix, effects, true poses. Default: not written.", metavar="DIR"
+    ),
     dataset: shared.WhichDataset = None,
-    effects: Annotated[
-        list[str] | None,
-        typer.Option("--effect", metavar="YAML", help="Add an effect, 'name: {parameter: value}'; may be repeated."),
-    ] = None,
-    like: Annotated[
-        Path | None,
-        typer.Option(metavar="DATASET", help="Instead of CONFIG: drive this data set's recorded wheel rates."),
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(metavar="CALIBRATION", help="With --like: the true model, a calibration file.")
-    ] = None,
-    noise: Annotated[
-        bool, typer.Option("--noise", help="With --like: add the noise that the calibration states.")
-    ] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="With --noise: its seed. Default: 0.")] = None,
+    effects: list[str] | None = option(
+        "Add an effect, 'name: {parameter: value}'; may be repeated.", "--effect", metavar="YAML"
+    ),
+    like: Path | None = option("Instead of CONFIG: drive this data set's recorded wheel rates.", metavar="DATASET"),
+    model: Path | None = option("With --like: the true model, a calibration file.", metavar="CALIBRATION"),
+    noise: bool = option("With --like: add the noise that the calibration states.", "--noise", default=False),
+    seed: int | None = option("With --noise: its seed. Default: 0.", min=0),
     table_format: shared.TableFormat = "parquet",
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
-    ] = None,
-    figures: shared.Figures = None,
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
     force: shared.Force = False,
     plugins: shared.Plugins = None,
 ) -> None:
@@ -572,12 +491,12 @@ def simulate(
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
-    shared.refuse_report(report, figures, force=force)
+    page.refuse(force=force)
     shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
 
-        def page() -> "Document":
+        def document() -> "Document":
             from omnibench.report.recording.section import recording_document
 
             watch(Progress("writing the report"))
@@ -585,7 +504,7 @@ def simulate(
             known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
             return recording_document(made.dataset, accuracy=made.accuracy, **known)
 
-        shared.write_asked_report(page, report, figures)
+        page.write(document)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
         from omnibench.cli.terminal.slam_summary import print_slam_accuracy  # with the report's tables: slow to import
@@ -593,7 +512,7 @@ def simulate(
         print_slam_accuracy(make_console(), made.accuracy)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")
-    if report is not None:
-        typer.echo(f"report: {report}")
+    if page.report is not None:
+        typer.echo(f"report: {page.report}")
     typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")
     print_ending(f"{output} is a data set like any other", "see what it tells", "omnibench", "inspect", output)
