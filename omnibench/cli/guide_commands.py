@@ -3,17 +3,15 @@
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Mapping
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from omnibench.cli.options import Force, Json, Plugins, argument, load_given_plugins, option, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, say
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
 from omnibench.words import plural
@@ -25,9 +23,8 @@ if TYPE_CHECKING:
 guide_app = typer.Typer()
 
 _READING_WIDTH = 100  # columns: longer lines are hard to follow
-_NAME_WIDTH = 15  # columns, of the longest topic
+_NAME_WIDTH = 17  # columns, of the longest topic and two spaces
 _MOST_LISTED = 10  # files of a folder that are written out by name
-_NAMES = _NAME_WIDTH + 4  # columns, with the spaces around it
 
 
 @guide_app.command()
@@ -41,7 +38,7 @@ def guide(
         listed = topics()
         for group in dict.fromkeys(topic.group for topic in listed):
             typer.echo(f"{group}:")
-            _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
+            print_names({topic.name: topic.summary for topic in listed if topic.group == group}, _NAME_WIDTH)
         print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
     else:
         # As pages on a terminal, as it stands where it is piped.
@@ -72,7 +69,7 @@ def example(
     from omnibench.cli.examples import EXAMPLES, find_example, write_example
 
     if name is None:
-        _print_names({each.name: each.summary for each in EXAMPLES})
+        print_names({each.name: each.summary for each in EXAMPLES}, _NAME_WIDTH)
         print_ending("these are the examples", "write one into a folder", "omnibench", "example", "small", "-o", "demo")
         return None
     chosen = find_example(name)
@@ -97,12 +94,6 @@ def example(
     for command in chosen.commands:
         typer.echo(f"  {command}")
     return print_ending(f"{output} holds the example {name}", "type the lines above")
-
-
-def _print_names(summaries: Mapping[str, str]) -> None:
-    width = make_console().width
-    for name, summary in summaries.items():
-        typer.echo(fill(summary, width, initial_indent=f"  {name:{_NAME_WIDTH}}  ", subsequent_indent=" " * _NAMES))
 
 
 _plugin = typer.Typer(help="Write a new plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)

@@ -1,9 +1,7 @@
 """``import``, ``fetch``, ``check``, ``inspect``, ``design``, ``slam`` and ``simulate``: recordings, old and new."""
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import typer
@@ -12,7 +10,7 @@ from typer.core import TyperCommand
 import omnibench
 from omnibench.cli import options as shared
 from omnibench.cli.options import argument, option, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import refuse_existing, resolved, write_text
@@ -20,8 +18,6 @@ from omnibench.progress import Progress
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from omnibench.check.check import CheckReport
     from omnibench.report.blocks import Document
 
@@ -39,14 +35,11 @@ class HelpOfImporters(TyperCommand):
             if (name := given.get("importer")) is not None:
                 from omnibench.cli.terminal.importer_help import importer_help
 
-                shared.load_given_plugins(_paths(given.get("plugins")), _paths(given.get("plugin_files")))
+                lists = [given.get(key) for key in ("plugins", "plugin_files")]
+                shared.load_given_plugins(*(None if each is None else [Path(one) for one in each] for each in lists))
                 typer.echo(importer_help(str(name), ctx.command_path))
                 ctx.exit()
         return super().parse_args(ctx, args)
-
-
-def _paths(given: Any) -> list[Path] | None:
-    return [Path(each) for each in given] if isinstance(given, list) else None
 
 
 @recording_app.command("import", cls=HelpOfImporters)
@@ -81,6 +74,7 @@ def import_(
     robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
     scans but without reference poses get these by SLAM.
     """
+    from omnibench.cli.terminal.recording_tables import print_import_ending
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
@@ -146,21 +140,7 @@ def import_(
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-    return print_ending(holds, *_next_step(output, report))
-
-
-def _next_step(folder: Path, report: "CheckReport | None") -> tuple[Any, ...]:
-    """The next step after an import in words, then the words to type."""
-    if report is None:
-        return "see what they tell", "omnibench", "inspect", folder
-    if report.command:
-        return "mend what it warns of" if report.verdict == "ready" else "mend it", *shlex.split(report.command)
-    if report.verdict == "ready":
-        return "calibrate it", "omnibench", "calibrate", folder, "-o", "calibration.yaml"
-    return "see what is missing", "omnibench", "check", folder
-
-
-_NAMES = 12  # columns of the list's names, with the spaces around them
+    return print_import_ending(holds, output, report)
 
 
 @recording_app.command()
@@ -179,40 +159,34 @@ def fetch(
     from omnibench.cli.fetch import RECORDINGS, fetch_recording
 
     if name is None:
-        width = make_console().width
         for recording in RECORDINGS:
             typer.echo(f"{recording.repository} ({recording.licence}); reference: {recording.reference}")
-            for listed in recording.datasets:
-                text = f"{listed.robot}: {listed.runs}"
-                typer.echo(fill(text, width, initial_indent=f"  {listed.name:10}", subsequent_indent=" " * _NAMES))
+            print_names({listed.name: f"{listed.robot}: {listed.runs}" for listed in recording.datasets}, 10)
         print_ending("these are the public recordings that are known", "fetch one", "omnibench", "fetch", "omni3")
         return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
-    for folder, dataset in fetched.datasets.items():
-        warn(f"{folder}: {each}" if len(fetched.datasets) > 1 else each for each in dataset.warnings)
-    for folder, dataset in fetched.datasets.items():
-        typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {folder}")
-    say(f"source: {fetched.source}, in {fetched.clone.folder}")
+    clone, several = fetched.clone, len(fetched.datasets) > 1
+    for folder, imported in fetched.datasets.items():
+        warn(f"{folder}: {each}" if several else each for each in imported.warnings)
+    for folder, imported in fetched.datasets.items():
+        typer.echo(f"{plural(len(imported.trajectories), 'trajectory')}: {folder}")
+    first, dataset = next(iter(fetched.datasets.items()), (clone.folder, None))
     licence = fetched.licence or "the repository states none; ask its authors before you use it"
     if fetched.licence_file is not None:
-        place = next(iter(fetched.datasets), fetched.clone.folder) / fetched.licence_file.name
-        licence = f"{fetched.licence or 'see'} ({place})"
-    say(f"licence: {licence}")
-    say(f"cite: {fetched.cite}")
-    # What there is now, and what to type.
-    clone = fetched.clone
-    if fetched.datasets:
-        folder, dataset = next(iter(fetched.datasets.items()))
-        count = plural(len(dataset.trajectories), "run")
-        rest = f" and {plural(len(fetched.datasets) - 1, 'more folder')}" if len(fetched.datasets) > 1 else ""
-        holds = f"{folder} holds {count} of {dataset.robot.name}" if not rest else f"{folder}{rest} hold the recordings"
-        return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", folder)
+        licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
+    for line in (f"source: {fetched.source}, in {clone.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
+        say(line)
+    holds = f"{clone.folder} holds {clone.repository}"
+    if dataset is not None:
+        holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
+        if several:
+            holds = f"{first} and {plural(len(fetched.datasets) - 1, 'more folder')} hold the recordings"
+        return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", first)
     make_console(error=True).print(f"not imported: {fetched.refusal}", soft_wrap=True)
     if not fetched.importer:
-        return print_ending(f"{clone.folder} holds {clone.repository}", "see what can be imported", "omnibench", "list")
-    command = ("omnibench", "import", fetched.importer, "--help")
-    return print_ending(f"{clone.folder} holds {clone.repository}", "see what its import needs", *command)
+        return print_ending(holds, "see what can be imported", "omnibench", "list")
+    return print_ending(holds, "see what its import needs", "omnibench", "import", fetched.importer, "--help")
 
 
 @recording_app.command()
@@ -236,6 +210,7 @@ def check(
     """
     from omnibench.check.check import check_recording
     from omnibench.check.source import next_command, read_source
+    from omnibench.cli.terminal.recording_tables import print_check
     from omnibench.config import parse_settings
 
     page.refuse(force=force)
@@ -253,48 +228,9 @@ def check(
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
-        _print_check(make_console(), checked, next_command(read))
+        print_check(make_console(), checked, next_command(read))
     if checked.verdict != "ready":
         raise typer.Exit(1)
-
-
-_COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
-_NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
-
-
-def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> None:
-    """Print the report; what can be typed is not wrapped, so that it can be copied.
-
-    next_step: the command line for a recording that is ready.
-    """
-    from rich.text import Text
-
-    colour = {"ready": "bold green", "fix": "bold red", "record more": "bold yellow"}[checked.verdict]
-    console.print(Text.assemble((checked.verdict.upper(), colour), f": {checked.sentence}."), soft_wrap=True)
-    for finding in checked.findings:
-        console.print()
-        said = Text.assemble((finding.severity, _COLOURS[finding.severity]), f": {finding.what} [{finding.where}]")
-        console.print(said, soft_wrap=True)
-        if finding.changes and finding.fix:
-            console.out(f"  --set {finding.fix}", highlight=False)
-        elif finding.fix:
-            console.print(f"  {finding.fix}", soft_wrap=True)
-    if checked.gain:
-        needed = _NEEDED[checked.needed]
-        console.print()
-        console.print(f"{needed}: {checked.gain}" if needed else checked.gain, soft_wrap=True)
-    console.print()
-    if checked.command and checked.verdict == "ready":
-        print_ending("nothing stands in the way", "mend what it warns of", *shlex.split(checked.command))
-    elif checked.command:
-        print_ending("what can be mended is mended by one import", "type", *shlex.split(checked.command))
-    elif checked.verdict == "record more":
-        print_ending("nothing of this can be typed", "record what is missing, and check again")
-    elif checked.verdict == "fix":
-        print_ending("no option mends this", "correct what is named above, and check again")
-    else:
-        words = shlex.split(next_step)
-        print_ending("nothing stands in the way", f"{words[1]} it", *words)
 
 
 @recording_app.command()
@@ -309,7 +245,7 @@ def inspect(
     as_json: shared.Json = False,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
-    from omnibench.cli.terminal.inspection_summary import print_inspection
+    from omnibench.cli.terminal.recording_tables import print_inspection
     from omnibench.report.recording.inspection_report import inspection_document
 
     page.refuse(force=force)
@@ -369,7 +305,7 @@ def design(
     These are the runs from which the matrix would be calibrated most precisely (D-optimal design): of those that were
     recorded or that a config lists, or, with --robot, of lines, arcs and turns that fit robot and room.
     """
-    from omnibench.cli.terminal.design_summary import print_design
+    from omnibench.cli.terminal.recording_tables import print_design
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.report import design_document
@@ -425,7 +361,7 @@ def slam(
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.slam_summary import print_slam
+    from omnibench.cli.terminal.recording_tables import print_slam
     from omnibench.config import parse_settings, validate
     from omnibench.slam.slam_options import SlamOptions
     from omnibench.slam.slam_request import SlamRequest
@@ -507,7 +443,7 @@ def simulate(
         page.write(document)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
-        from omnibench.cli.terminal.slam_summary import print_slam_accuracy  # with the report's tables: slow to import
+        from omnibench.cli.terminal.recording_tables import print_slam_accuracy
 
         print_slam_accuracy(make_console(), made.accuracy)
     if truth is not None:
