@@ -14,9 +14,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from omnibench.check.evidence import Evidence
+from omnibench.check.evidence import SAME, Evidence, looks_of, pose_period
 from omnibench.check.hypotheses import another_zero, wheels_in_words
-from omnibench.check.streams import SAME, looks_of, pose_period
 from omnibench.data.dataset import Trajectory
 from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
 from omnibench.data.importers.copied_reference import follows_the_wheels

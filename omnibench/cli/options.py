@@ -113,7 +113,7 @@ PluginFiles = Annotated[
 
 
 # Modules that jobs which read a data set share.
-_READING = ("omnibench.check.streams", "omnibench.check.clocks", "omnibench.robot.compiled_beforehand")
+_READING = ("omnibench.check.evidence", "omnibench.robot.compiled_beforehand")
 
 
 @dataclass(frozen=True)
