@@ -1,4 +1,4 @@
-"""The evidence of a recording: its clocks, a look at each run, free fits and mistakes, shared by the detectors of a check."""
+"""The evidence of a recording: its clocks, a look at each run, free fits and mistakes, which detectors share."""
 
 from __future__ import annotations
 

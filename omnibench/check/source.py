@@ -172,9 +172,10 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
             dataset = _read(name, source, {**options, "fastest": _ANY_RATE})
         except (DataError, ConfigError):
             raise refusal from None
-    if dataset.referenced:
-        return dataset
-    raise DataError(f"{source}: it has no reference poses; import it, which makes them from its scans, and check that")
+    if not dataset.referenced:
+        lacking = "it has no reference poses; import it, which makes them from its scans, and check that"
+        raise DataError(f"{source}: {lacking}")
+    return dataset
 
 
 def _title(source: Path) -> str:
@@ -227,12 +228,11 @@ def other_times(given: Mapping[str, Any]) -> Iterator[Finding]:
 
 def with_fixes(read: RecordingSource, findings: Sequence[Finding]) -> list[Finding]:
     """The findings, each with the options that mend it where they are not set already."""
-    fixed = []
-    for finding in findings:
-        if finding.changes and (settings := settings_of(read, [finding])):
-            finding = finding.model_copy(update={"fix": " --set ".join(settings)})
-        fixed.append(finding)
-    return fixed
+    settings = [settings_of(read, [finding]) if finding.changes else [] for finding in findings]
+    return [
+        finding.model_copy(update={"fix": " --set ".join(typed)}) if typed else finding
+        for finding, typed in zip(findings, settings, strict=True)
+    ]
 
 
 def settings_of(read: RecordingSource, findings: Sequence[Finding]) -> list[str]:
@@ -293,12 +293,11 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
         case "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
             turned = round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)
             return {"pose_signs": _product(options.get("pose_signs"), [1, -1, 1]), "heading_offset_deg": turned}
-        case "wheel_signs" | "pose_signs":
-            return {key: _product(present, value)}
-        case "steering_signs":  # offsets are added after the signs
-            offsets = options.get("steering_offsets_deg")
-            turned_back = {"steering_offsets_deg": _product(offsets, value)} if offsets else {}
-            return {key: _product(present, value), **turned_back}
+        case "wheel_signs" | "pose_signs" | "steering_signs":
+            changed: dict[str, Any] = {key: _product(present, value)}
+            if key == "steering_signs" and (offsets := options.get("steering_offsets_deg")):
+                changed["steering_offsets_deg"] = _product(offsets, value)  # they are added after the signs
+            return changed
         case "steering_factors":
             return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
         case "steering_offsets_deg":

@@ -44,8 +44,8 @@ def compare(
     jobs: shared.BackendOptions = shared.BackendOptions(
         workers=option("Processes, or Dask workers started here. Default: the config's.", min=1)
     ),
-    figures: shared.Figures = None,
-    force: shared.Force = False,
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
     plugins: list[Path] | None = option(
         "Folder of plug-ins besides the config's; may be repeated.", "--plugins", metavar="DIR"
     ),
@@ -154,16 +154,16 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
 @shared.grouped
 def calibrate(
     context: typer.Context,
-    dataset: shared.DatasetFolders,
+    dataset: list[Path] = shared.DATASETS,
     output: Path | None = output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml"),
     page: shared.ReportOptions = shared.report_options(
         "Write a page: before and after, paths, parameters, errors by motion."
     ),
     jobs: shared.BackendOptions = shared.BackendOptions(),
-    settings: shared.Settings = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    settings: list[str] | None = shared.SETTINGS,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Fit a robot's odometry model; write it with -o.
 
@@ -218,7 +218,7 @@ def calibrate(
 @calibration_app.command()
 @shared.grouped
 def evaluate(
-    calibration: shared.CalibrationFile,
+    calibration: Path = shared.CALIBRATION,
     dataset: list[Path] | None = argument(
         "Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."
     ),
@@ -232,9 +232,9 @@ def evaluate(
         "Write a page: before and after, paths, parameters, errors by motion."
     ),
     jobs: shared.BackendOptions = shared.BackendOptions(),
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Show a calibration's errors on a data set, and those on paths.
 
@@ -277,8 +277,8 @@ def evaluate(
 @calibration_app.command()
 @shared.grouped
 def certify(
-    calibration: shared.CalibrationFile,
-    dataset: shared.DatasetFolders,
+    calibration: Path = shared.CALIBRATION,
+    dataset: list[Path] = shared.DATASETS,
     box: Literal["paper", "row"] | None = option(
         "Matrices to compare with; see calibrate. Default: the box of the calibration's search."
     ),
@@ -286,8 +286,8 @@ def certify(
     seconds: float = option("Stop after this time, in s; the bound proven by then holds.", default=60.0, min=0.0),
     parts: int | None = option("Stop after so many parts of the box: a limit that no machine changes.", min=1),
     jobs: shared.BackendOptions = shared.BackendOptions(),
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Prove how far a calibration's cost is from the lowest possible.
 
@@ -319,11 +319,11 @@ def certify(
 
 @calibration_app.command()
 def export(
-    calibration: shared.CalibrationFile,
+    calibration: Path = shared.CALIBRATION,
     to: str = option("ros2_controllers, robot_localization or c_header.", "--to", default=..., metavar="FORMAT"),
     output: Path | None = output_option("File or folder to write to. Default: standard output."),
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Convert a calibration for ROS 2 or C programs.
 
@@ -347,7 +347,7 @@ def export(
 
 @calibration_app.command()
 def discover(
-    dataset: shared.DatasetFolder,
+    dataset: Path = shared.DATASET,
     model: Path | None = option(
         "Start from this calibration. Default: fit a matrix.", "--model", metavar="CALIBRATION"
     ),
@@ -357,10 +357,10 @@ def discover(
         "Where no name is sure, close the gap all the same, by a term without a name.", default=True
     ),
     seed: int = option("Seed of the random numbers.", default=0, min=0),
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Find and name the physics that a robot's model lacks.
 

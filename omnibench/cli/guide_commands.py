@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Json, Plugins, argument, load_given_plugins, option, output_option
+from omnibench.cli.options import FORCE, JSON, PLUGINS, argument, load_given_plugins, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
@@ -60,7 +60,7 @@ def guide(
 def example(
     name: str | None = argument("One of the list that is shown without it."),
     output: Path | None = output_option("Folder to write to.", metavar="DIR"),
-    force: Force = False,
+    force: bool = FORCE,
 ) -> None:
     """Write an example to begin with, or list the examples.
 
@@ -110,7 +110,7 @@ _CONFIGS = {
 
 
 @guide_app.command("list")
-def list_(plugins: Plugins = None, as_json: Json = False) -> None:
+def list_(plugins: list[Path] | None = PLUGINS, as_json: bool = JSON) -> None:
     """List calibrators, costs, effects and importers.
 
     Each with where it comes from: built in, a plug-in's file, or an installed package.
@@ -160,7 +160,7 @@ def plugin_new(
     kind: str | None = option("calibrator, importer, cost or effect. Default: calibrator.", metavar="KIND"),
     effect: bool = option("Short for --kind effect.", "--effect", default=False),
     folder: Path = option("Folder to write to.", "--folder", "-o", "--output", default=Path("plugins"), metavar="DIR"),
-    force: Force = False,
+    force: bool = FORCE,
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.testing.plugin_files import new_plugin

@@ -4,11 +4,11 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Plugins, argument, load_given_plugins, option, output_option, plugin_folders
+from omnibench.cli.options import FORCE, PLUGINS, argument, load_given_plugins, option, output_option, plugin_folders
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
@@ -20,18 +20,13 @@ if TYPE_CHECKING:
 live_app = typer.Typer()
 _LISTENING = 0.2  # s between two looks at whether a signal came; chosen
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", help="How to reach the node: YAML with zenoh, profile, domain; or the node's own config."),
-]
-Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of the node, for example tcp/127.0.0.1:7447.")]
-ProfileOption = Annotated[
-    Literal["plain", "rmw", "humble"] | None,
-    typer.Option(
-        help="Naming of topics: plain Zenoh, rmw_zenoh, or that of ROS 2 Humble. Default: as in --config, or plain."
-    ),
-]
-Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after this time, in s. Default: on Ctrl-C.")]
+Profile = Literal["plain", "rmw", "humble"]
+_CONFIG = option("How to reach the node: YAML with zenoh, profile, domain; or the node's own config.", "--config")
+_CONNECT = option("Endpoint of the node, for example tcp/127.0.0.1:7447.", "--connect")
+_PROFILE = option(
+    "Naming of topics: plain Zenoh, rmw_zenoh, or that of ROS 2 Humble. Default: as in --config, or plain."
+)
+_SECONDS = option("Stop after this time, in s. Default: on Ctrl-C.", min=0.0)
 
 
 @live_app.command()
@@ -43,8 +38,8 @@ def live(
     replay: bool = option("Play a recording to the node, show its errors, and end.", "--replay", default=False),
     speed: str | None = option("Speed of the replay: 1, 10, ... or max. Default: the config's."),
     foxglove: bool = option("Serve Foxglove's WebSocket on this computer.", "--foxglove", default=False),
-    seconds: Seconds = None,
-    plugins: Plugins = None,
+    seconds: float | None = _SECONDS,
+    plugins: list[Path] | None = PLUGINS,
 ) -> None:
     """Run the node: wheel samples in, odometry out, over Zenoh.
 
@@ -122,11 +117,11 @@ def replay(
         "Set what a node's config holds under replay; may be repeated.", "--set", metavar="KEY=VALUE"
     ),
     calibration: Path | None = option("Calibration whose noise model gives the covariance of the SLAM poses."),
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
-    plugins: Plugins = None,
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
+    plugins: list[Path] | None = PLUGINS,
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would.
 
@@ -163,10 +158,10 @@ def replay(
 @live_app.command()
 def listen(
     robot: str | None = argument("Name of the robot. Default: all that are heard."),
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
     as_json: bool = option("Print one JSON document a line, once a second.", "--json", default=False),
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
@@ -185,9 +180,9 @@ def listen(
 def swap(
     robot: str = argument("Name of the robot.", default=...),
     calibration: Path = argument("Calibration file to run from now on.", default=...),
-    config: ConfigOption = None,
-    connect: Connect = None,
-    plugins: Plugins = None,
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    plugins: list[Path] | None = PLUGINS,
 ) -> None:
     """Give a running node another calibration, without a jump.
 
@@ -209,12 +204,12 @@ def record(
         "Names of robots, or the config of a node with them.", default=..., metavar="ROBOT...|CONFIG"
     ),
     output: Path = output_option("MCAP file to write.", default=..., metavar="FILE.mcap"),
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
     topics: list[str] | None = option("Record only this topic; may be repeated. Default: all.", "--topic"),
-    force: Force = False,
+    force: bool = FORCE,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.live_tables import record as write

@@ -74,43 +74,25 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
-DatasetFolders = Annotated[
-    list[Path],
-    typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
-]
-CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
-WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
-Figures = Annotated[
-    Path | None,
-    typer.Option(
-        "--figures",
-        metavar="DIR",
-        help="Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).",
-    ),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set an option, its value in YAML; may be repeated."),
-]
-TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the data set's tables.")]
-Plugins = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--plugins",
-        metavar="DIR",
-        envvar="OMNIBENCH_PLUGINS",
-        help="Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
-    ),
-]
-
-PluginFiles = Annotated[
-    list[Path] | None,
-    typer.Option("--plugin", metavar="FILE", help="One plug-in file to load; may be repeated."),
-]
-
+DATASET = argument("Data set folder.", default=...)
+DATASETS = argument(
+    "Data set folder; several of one robot, or a glob, count as one.", default=..., metavar="DATASET..."
+)
+CALIBRATION = argument("Calibration file.", default=...)
+WHICH_DATASET = option("Name of the data set, if the config has several.")
+JSON = option("Print one JSON document on standard output, and nothing else.", "--json", default=False)
+FORCE = option("Replace what is there already.", "--force", default=False)
+FIGURES = option("Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).", metavar="DIR")
+SETTINGS = option("Set an option, its value in YAML; may be repeated.", "--set", metavar="KEY=VALUE")
+TableFormat = Literal["parquet", "csv"]
+TABLE_FORMAT = option("Format of the data set's tables.", "--format", default="parquet")
+PLUGINS = option(
+    "Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
+    "--plugins",
+    metavar="DIR",
+    envvar="OMNIBENCH_PLUGINS",
+)
+PLUGIN_FILES = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE")
 
 # Modules that jobs which read a data set share.
 _READING = ("omnibench.check.evidence", "omnibench.robot.compiled_beforehand")
@@ -171,7 +153,7 @@ class ReportOptions:
     """Options of the commands that write a page on request."""
 
     report: Path | None = option("Write a page with figures.", metavar="FILE.html")
-    figures: Figures = None
+    figures: Path | None = FIGURES
 
     @property
     def asked(self) -> bool:

@@ -49,7 +49,7 @@ def import_(
     ),
     source: Path | None = argument("File or folder with the recordings."),
     output: Path | None = output_option("Data set folder to write."),
-    settings: shared.Settings = None,
+    settings: list[str] | None = shared.SETTINGS,
     accept_units: bool = option(
         "Write the data set even if units look wrong by magnitude.", "--accept-units", default=False
     ),
@@ -63,10 +63,10 @@ def import_(
         default=False,
     ),
     no_check: bool = option("Leave out the check of what was recorded.", "--no-check", default=False),
-    table_format: shared.TableFormat = "parquet",
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    plugin_files: shared.PluginFiles = None,
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    plugin_files: list[Path] | None = shared.PLUGIN_FILES,
 ) -> None:
     """Convert recordings into a data set.
 
@@ -150,7 +150,7 @@ def fetch(
         "Data set folder to write; of several data sets, the folder above. Default: data/NAME."
     ),
     commit: str | None = option("Commit to take; HEAD: the newest. Default: the one that was tested.", metavar="SHA"),
-    force: shared.Force = False,
+    force: bool = shared.FORCE,
 ) -> None:
     """Clone a public recording from GitHub and import it.
 
@@ -197,12 +197,12 @@ def check(
     ),
     importer: str | None = option("Importer of the source. Default: by its files.", "--format", metavar="NAME"),
     robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
-    settings: shared.Settings = None,
+    settings: list[str] | None = shared.SETTINGS,
     page: shared.ReportOptions = shared.report_options("Write a page with figures of clocks and findings."),
     plugin: list[Path] | None = option("A plug-in with an importer; may be repeated.", "--plugin", metavar="FILE"),
     jobs: shared.BackendOptions = shared.BackendOptions(),
-    force: shared.Force = False,
-    as_json: shared.Json = False,
+    force: bool = shared.FORCE,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Say what is wrong with a recording, and what to type.
 
@@ -236,13 +236,13 @@ def check(
 @recording_app.command()
 @shared.grouped
 def inspect(
-    dataset: shared.DatasetFolders,
+    dataset: list[Path] = shared.DATASETS,
     page: shared.ReportOptions = shared.report_options(
         "Write a page: paths, motions driven, wheel rates, runs step by step."
     ),
     jobs: shared.BackendOptions = shared.BackendOptions(),
-    force: shared.Force = False,
-    as_json: shared.Json = False,
+    force: bool = shared.FORCE,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
     from omnibench.cli.terminal.recording_tables import print_inspection
@@ -276,7 +276,7 @@ def design(
     per: Literal["run", "second", "metre"] = option("Effort to keep small: runs, time or distance.", default="run"),
     runs: int | None = option("Runs to choose. Default: the fewest within 1 % of the optimum.", min=1),
     repetitions: int | None = option("How often a command may be chosen at most.", min=1),
-    dataset: shared.WhichDataset = None,
+    dataset: str | None = shared.WHICH_DATASET,
     integration: Literal["euler", "arc"] | None = option(
         "Path within a sample; see calibrate. Default: the config's, or arc for a data set."
     ),
@@ -295,10 +295,10 @@ def design(
     position_noise: float | None = option("With --robot: of the reference's positions, m. Default: 0.005."),
     heading_noise: float | None = option("With --robot: of the reference's headings, deg. Default: 0.3."),
     output: Path | None = output_option("Folder for report.html and design.json. Default: nothing is written."),
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Choose the motion commands that are most worth driving.
 
@@ -351,11 +351,11 @@ def slam(
     model: Path | None = option("Calibration for that odometry. Default: the design values.", metavar="CALIBRATION"),
     truth: Path | None = option("Folder that simulate --truth wrote: show the errors against it.", metavar="DIR"),
     page: shared.ReportOptions = shared.report_options("Write a page with figures of scans, paths and wheels."),
-    settings: shared.Settings = None,
-    table_format: shared.TableFormat = "parquet",
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    settings: list[str] | None = shared.SETTINGS,
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Compute reference poses from the laser scans of a data set.
 
@@ -406,7 +406,7 @@ def simulate(
     truth: Path | None = option(
         "Folder for the truth: matrix, effects, true poses. Default: not written.", metavar="DIR"
     ),
-    dataset: shared.WhichDataset = None,
+    dataset: str | None = shared.WHICH_DATASET,
     effects: list[str] | None = option(
         "Add an effect, 'name: {parameter: value}'; may be repeated.", "--effect", metavar="YAML"
     ),
@@ -414,10 +414,10 @@ def simulate(
     model: Path | None = option("With --like: the true model, a calibration file.", metavar="CALIBRATION"),
     noise: bool = option("With --like: add the noise that the calibration states.", "--noise", default=False),
     seed: int | None = option("With --noise: its seed. Default: 0.", min=0),
-    table_format: shared.TableFormat = "parquet",
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
     page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Simulate recordings of a robot whose true model is known.
 
