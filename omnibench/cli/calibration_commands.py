@@ -198,11 +198,9 @@ def calibrate(
     if as_json:
         return print_json(calibration)
     file = [] if output is None else [f"calibration: {output}"]
-    ending = [
-        "whether it is better, and what to do next, in a line that is longer than many terminals are wide",
-        "COMMAND",
-    ]
-    room = print_calibration(make_console(), run, [*warnings, *file, verdict.sentence, *ending], verdict.detail)
+    # The last sentence takes a line that is longer than many terminals are wide, and the command one more.
+    printed = [*warnings, *file, verdict.sentence, 96 * ".", "COMMAND"]
+    room = print_calibration(make_console(), run, printed, verdict.detail)
     for line in file:
         typer.echo(line)
     print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
@@ -299,15 +297,9 @@ def certify(
     with ProgressDisplay() as watch, jobs.opened(watch, "omnibench.fit.certify") as backend:
         recordings = omnibench.load_dataset(dataset)
         certified = omnibench.certify_optimum(
-            omnibench.read_calibration(calibration),
-            recordings,
-            box=box,
-            gap=gap,
-            seconds=seconds,
-            parts=parts,
-            watch=watch,
-            backend=backend,
-        )
+            omnibench.read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, parts=parts,
+            watch=watch, backend=backend,
+        )  # fmt: skip
     warn(recordings.warnings)
     if not certified.inside:
         warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])

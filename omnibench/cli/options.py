@@ -14,7 +14,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -69,9 +69,14 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
             given[name] = replace(group, **{field.name: given.pop(field.name) for field in fields(group)})
         function(*arguments, **given)
 
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return command
+    return _with_parameters(command, parameters)
+
+
+def _with_parameters(function: Callable[..., None], parameters: list[inspect.Parameter]) -> Callable[..., None]:
+    """A function for which Typer makes an option or argument of each of these parameters."""
+    function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return function
 
 
 DATASET = argument("Data set folder.", default=...)
@@ -250,7 +255,9 @@ class FitCommand(TyperCommand):
         if not self._choices:
             from omnibench.fit.settings import FitSettings
 
-            made = options_of(FitSettings)
+            app = typer.Typer(add_completion=False)
+            app.command()(_with_parameters(lambda: None, list(_parameters(FitSettings))))
+            made: list[Any] = list(typer.main.get_command(app).params)
             self._choices = tuple(option.name for option in made)
             after = 1 + [parameter.name for parameter in self.params].index("output")
             self.params[after:after] = made
@@ -260,20 +267,6 @@ class FitCommand(TyperCommand):
         """Call the function, with the values of FitSettings' options in ``ctx.obj``."""
         ctx.obj = {name: ctx.params.pop(name) for name in self._choices}
         return super().invoke(ctx)
-
-
-def options_of(model: type[BaseModel]) -> list[Any]:
-    """Options of a command line for the fields of a model, and of models in it, that are text, a number or a flag."""
-
-    def chosen() -> None: ...
-
-    parameters = list(_parameters(model))
-    chosen.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    chosen.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    app = typer.Typer(add_completion=False)
-    app.command()(chosen)
-    command: Any = typer.main.get_command(app)
-    return list(command.params)
 
 
 def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
@@ -289,15 +282,13 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
         if schema is None:
             continue
-        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
+        kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
-        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
-        flag = [f"--{name}"] if annotation is bool else []
-        option = typer.Option(*flag, help=field.description, min=least)
-        annotation = annotation | None if field.default is None else annotation
-        yield inspect.Parameter(
-            name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=Annotated[annotation, option]
-        )
+        least = least + 1 if kind is int and "exclusiveMinimum" in schema else least
+        flag = [f"--{name}"] if kind is bool else []
+        made = option(field.description or "", *flag, default=field.default, min=least)
+        kind = kind | None if field.default is None else kind
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=kind)
 
 
 def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:
