@@ -148,10 +148,11 @@ def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _:
     robot, runs, fitted = task
     clocks = list[ClockMatch | None]()
     for run in runs:
-        windows = ClockWindows.of(robot, Streams.of_run(run))
-        if windows is not None:
+        if (windows := ClockWindows.of(robot, Streams.of_run(run))) is None:
+            clocks.append(None)
+        else:
             clock = windows.improved(fitted, windows.scanned(SEARCH, fitted), ROUNDS)
-        clocks.append(None if windows is None else windows.match(fitted, clock, SEARCH))
+            clocks.append(windows.match(fitted, clock, SEARCH))
     return clocks
 
 

@@ -130,8 +130,9 @@ def reference_faults(evidence: Evidence) -> Iterator[Finding]:
     if long:
         what = f"the reference stands still for up to {max(frozen[run] for run in long):.1f} s while wheels drive"
         if len(long) == count:
-            fix = "in every run: check its tracking, and record again"
-            yield error("reference_frozen", what, "the reference", fix=fix)
+            yield error(
+                "reference_frozen", what, "the reference", fix="in every run: check its tracking, and record again"
+            )
         else:
             yield error("reference_frozen", what, runs_in_words(long, count), {"leave_out": long})
     if short:
@@ -186,11 +187,9 @@ def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
         elif dead.any() and windows is not None:
             lost = windows.unexplained(windows.only(~dead[windows.run]).fit(robot.reach), robot.reach, len(looks))
             if (dead := dead & (lost > np.maximum(_UNEXPLAINED, _UNUSUAL * np.median(lost)))).any():
-                runs = [look.run for look, is_dead in zip(looks, dead.tolist(), strict=True) if is_dead]
-                at = runs_in_words(runs, len(looks))
-                yield error(
-                    "wheel_dead", f"{where} never turns in {at}, {why}", f"{where} in {at}", {"leave_out": runs}
-                )
+                runs = [looks[number].run for number in np.flatnonzero(dead)]
+                where = f"{where} in {runs_in_words(runs, len(looks))}"
+                yield error("wheel_dead", f"{where} never turns, {why}", where, {"leave_out": runs})
 
 
 def _frozen_steering(evidence: Evidence) -> Iterator[Finding]:
@@ -230,16 +229,18 @@ def _unsigned_counts(evidence: Evidence) -> Iterator[Finding]:
     moved = windows.moved * np.exp(-0.5j * windows.turned)
     expected = np.column_stack([moved.real, moved.imag, windows.turned]) @ robot.signal_equations.T
     usual = 0.1 * np.abs(expected).max(axis=0)
-    back = (expected < -usual) & (np.abs(windows.driven) > 0)
-    single = []
-    for index, counts in enumerate(windows.driven.T):
-        falls = min((counts < 0).mean(), (counts > 0).mean())
-        both = min(back[:, index].mean(), (expected[:, index] > usual[index]).mean())
-        if falls < _HARDLY and both > _BOTH and np.corrcoef(np.abs(expected[:, index]), np.abs(counts))[0, 1] > _ALIKE:
-            single.append(index)
+    back = (expected < -usual) & (windows.driven != 0)
+    turned = np.abs(windows.driven)
+    falls = np.minimum((windows.driven < 0).mean(axis=0), (windows.driven > 0).mean(axis=0))
+    both = np.minimum(back.mean(axis=0), (expected > usual).mean(axis=0))
+    single = [
+        index
+        for index in np.flatnonzero((falls < _HARDLY) & (both > _BOTH)).tolist()
+        if np.corrcoef(np.abs(expected[:, index]), turned[:, index])[0, 1] > _ALIKE
+    ]
     if single:
         reversing = np.bincount(windows.run, back[:, single].any(axis=1), len(runs))
-        names = [run.id for run, count in zip(runs, reversing.tolist(), strict=True) if count > 1]
+        names = [runs[number].id for number in np.flatnonzero(reversing > 1)]
         where = wheels_in_words([robot.wheel_names[index] for index in single])
         what = f"the counts of {where} never fall, though the reference shows that the robot reverses: do its encoders "
         what += "have one channel, which counts up whichever way a wheel turns?"
@@ -282,22 +283,19 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
         if abs(gone) > max(_LEAST_OFF, quantile * clock.drift_error * clock.length):
             drift[run.id] = gone
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (("clock_offset", offset), ("clock_drift", drift))
-    for kind, found in kinds:
-        if not found:
+    for kind, off in kinds:
+        if not off:
             continue
-        least, most = min(found.values()), max(found.values())
-        size = max(-least, most)
-        every = len(found) == count
-        among = "every run" if every else f"{len(found)} of {count} runs"
+        least, most, every = min(off.values()), max(off.values()), len(off) == count
+        size, among = max(-least, most), "every run" if every else f"{len(off)} of {count} runs"
         if kind == "clock_offset":
-            ways = [f"{off:.2f} s too {way}" for way, off in (("late", -least), ("early", most)) if off > 0]
-            off = " to ".join(ways) if len(ways) > 1 else f"up to {ways[0]}"
-            what = f"the stamps of the reference are {off} in {among}"
+            ways = [f"{seconds:.2f} s too {way}" for way, seconds in (("late", -least), ("early", most)) if seconds > 0]
+            what = f"the stamps of the reference are {'up to ' if len(ways) < 2 else ''}{' to '.join(ways)} in {among}"
         else:
-            way = "slow" if size == most else "fast"
-            what = f"the reference's clock goes too {way}, by up to {size:.2f} s a run, in {among}"
+            what = f"the reference's clock goes too {'slow' if size == most else 'fast'}, by up to {size:.2f} s a run"
+            what += f", in {among}"
         severity: Severity = "error" if size > _SPOILS else "warning"
-        where = "the reference" if every else runs_in_words(list(found), count)
+        where = "the reference" if every else runs_in_words(list(off), count)
         yield Finding(kind=kind, what=what, where=where, severity=severity, changes={"clocks": "match"})
 
 
@@ -310,7 +308,7 @@ def copied_runs(evidence: Evidence) -> Iterator[Finding]:
     for run in runs:
         digests = _digests(run)
         keys = set(digests[digests % every == 0].tolist())
-        shared = [seen[key] for key in keys if key in seen]
+        shared = [seen[key] for key in keys & seen.keys()]
         if keys and len(shared) > _SHARED * len(keys):
             copies[run.id] = max(set(shared), key=shared.count)
         else:
@@ -351,10 +349,8 @@ def odd_references(evidence: Evidence) -> Iterator[Finding]:
                 what = f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in "
                 what += f"{'degrees' if unit == 'deg' else unit}: they must be in {must}"
                 where, option = f"references of kind {kind}", _OPTIONS[must]
-                fix = "write these references in m and rad, as the poses are, and import again"
-                yield (
-                    error(option, what, where, fix=fix) if evidence.runs else error(option, what, where, {option: unit})
-                )
+                fix = "write these references in m and rad, as the poses are, and import again" if evidence.runs else ""
+                yield error(option, what, where, {} if evidence.runs else {option: unit}, fix=fix)
 
 
 def _sizes(model: OdometryModel, run: Trajectory, references: References) -> tuple[Array, Array]:

@@ -89,13 +89,9 @@ def left_open(evidence: Evidence) -> Iterator[Finding]:
     for number, sentence in enumerate(open_sentences(evidence.dataset.robot, training) if training else ()):
         what, _, fix = sentence.rpartition("; " if "; " in sentence else ": ")
         missing = what.startswith(("no reference tells of turning", "no reference tells of lengths"))
-        yield Finding(
-            kind="motion_missing" if missing else "references_leave_open",
-            what=what,
-            where="the recording" if not number else f"the recording, {number + 1}",
-            severity="warning" if missing else "note",
-            fix=fix,
-        )
+        kind: Kind = "motion_missing" if missing else "references_leave_open"
+        where = f"the recording, {number + 1}" if number else "the recording"
+        yield Finding(kind=kind, what=what, where=where, severity="warning" if missing else "note", fix=fix)
 
 
 def _warning(kind: Kind, what: str, fix: str) -> Finding:
