@@ -130,9 +130,8 @@ def reference_faults(evidence: Evidence) -> Iterator[Finding]:
     if long:
         what = f"the reference stands still for up to {max(frozen[run] for run in long):.1f} s while wheels drive"
         if len(long) == count:
-            yield error(
-                "reference_frozen", what, "the reference", fix="in every run: check its tracking, and record again"
-            )
+            fix = "in every run: check its tracking, and record again"
+            yield error("reference_frozen", what, "the reference", fix=fix)
         else:
             yield error("reference_frozen", what, runs_in_words(long, count), {"leave_out": long})
     if short:
@@ -187,9 +186,10 @@ def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
         elif dead.any() and windows is not None:
             lost = windows.unexplained(windows.only(~dead[windows.run]).fit(robot.reach), robot.reach, len(looks))
             if (dead := dead & (lost > np.maximum(_UNEXPLAINED, _UNUSUAL * np.median(lost)))).any():
-                runs = [looks[number].run for number in np.flatnonzero(dead)]
-                where = f"{where} in {runs_in_words(runs, len(looks))}"
-                yield error("wheel_dead", f"{where} never turns, {why}", where, {"leave_out": runs})
+                runs = [looks[number].run for number in np.flatnonzero(dead).tolist()]
+                at = runs_in_words(runs, len(looks))
+                what = f"{where} never turns in {at}, {why}"
+                yield error("wheel_dead", what, f"{where} in {at}", {"leave_out": runs})
 
 
 def _frozen_steering(evidence: Evidence) -> Iterator[Finding]:
@@ -240,7 +240,7 @@ def _unsigned_counts(evidence: Evidence) -> Iterator[Finding]:
     ]
     if single:
         reversing = np.bincount(windows.run, back[:, single].any(axis=1), len(runs))
-        names = [runs[number].id for number in np.flatnonzero(reversing > 1)]
+        names = [runs[number].id for number in np.flatnonzero(reversing > 1).tolist()]
         where = wheels_in_words([robot.wheel_names[index] for index in single])
         what = f"the counts of {where} never fall, though the reference shows that the robot reverses: do its encoders "
         what += "have one channel, which counts up whichever way a wheel turns?"
