@@ -139,17 +139,8 @@ _CAUSES = (
 )
 
 
-@dataclass(frozen=True)
-class Clone:
-    """A clone in ``folder`` with nothing changed. commit: the one that is checked out, in full."""
-
-    repository: str
-    folder: Path
-    commit: str
-
-
-def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> Clone:
-    """The clone of OWNER/REPO in ``folder`` at a commit; one that is there is used again.
+def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> str:
+    """Clone OWNER/REPO into ``folder`` and check a commit out, whose full name it returns; a clone is used again.
 
     ConfigError or DataError in one line: no such repository or commit, no git, no network, no space, or the folder
     holds something else or a clone that was changed.
@@ -173,7 +164,7 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
             _work(repository, ("fetch", "--progress", *whole, "origin"), folder, report)
         if _find(folder, commit) != _find(folder, NEWEST):
             _check_out(repository, folder, commit, report)
-        return Clone(repository, folder, _find(folder, NEWEST))
+        return _find(folder, NEWEST)
     # It is cloned into a folder beside, which is renamed once it is whole; whatever ends this leaves nothing there.
     check_place(folder)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
@@ -193,7 +184,7 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
         with suppress(OSError):
             for parent in made:  # they stay unless empty
                 parent.rmdir()
-    return Clone(repository, folder, _find(folder, NEWEST))
+    return _find(folder, NEWEST)
 
 
 def _check_out(repository: str, folder: Path, commit: str, report: Reporter) -> None:
@@ -285,11 +276,14 @@ _LONGEST = 80  # characters of a licence's title; chosen
 class Fetched:
     """A public recording on this disk.
 
-    cite: the article, or else the repository. licence: as the data sets say it, empty if it is not known. licence_file:
-    its text in the clone. datasets: by their folders. refusal: why nothing was imported; importer: that was tried.
+    folder, commit: of the clone of its repository. cite: the article, or else the repository. licence: as the data sets
+    say it, empty if it is not known. licence_file: its text in the clone. datasets: by their folders. refusal: why
+    nothing was imported; importer: that was tried.
     """
 
-    clone: Clone
+    repository: str
+    folder: Path
+    commit: str
     cite: str
     licence: str
     licence_file: Path | None
@@ -300,7 +294,7 @@ class Fetched:
     @property
     def source(self) -> str:
         """The origin, as the data sets say it."""
-        return f"public GitHub repository {self.clone.repository}, commit {self.clone.commit}"
+        return f"public GitHub repository {self.repository}, commit {self.commit}"
 
 
 def fetch_recording(
@@ -326,11 +320,10 @@ def fetch_recording(
         check_dataset_folder(folder)
     refuse_existing(*folders, force=force, folders=True)
     recording = asked.recording
-    clone = open_clone(
-        asked.repository, CLONES / asked.repository, commit or (recording.commit if recording else NEWEST), report
-    )
-    file = _licence_file(clone.folder)
-    cite, licence, importer = f"{GITHUB}/{clone.repository}", "", ""
+    place = CLONES / asked.repository
+    commit = open_clone(asked.repository, place, commit or (recording.commit if recording else NEWEST), report)
+    file = _licence_file(place)
+    cite, licence, importer = f"{GITHUB}/{asked.repository}", "", ""
     if recording is not None:
         cite, licence, importer = recording.article or cite, recording.licence, recording.importer
         # The importer is the catalogue's plug-in, unless one of that name is there.
@@ -342,13 +335,13 @@ def fetch_recording(
         # A licence's title is the first line of its text.
         text = file.read_text(encoding="utf-8", errors="replace")
         licence = next((line.strip()[:_LONGEST] for line in text.split("\n") if line.strip()), "")
-    fetched = Fetched(clone, cite, licence, file, {}, importer=importer)
+    fetched = Fetched(asked.repository, place, commit, cite, licence, file, {}, importer=importer)
     imported = dict[Path, Dataset]()
     for folder, asked_dataset in zip(folders, asked.datasets, strict=True):
         task = f"importing {asked_dataset.name}" if recording else "importing"
-        source = clone.folder / asked_dataset.path
+        source = place / asked_dataset.path
         if not source.exists():
-            raise DataError(f"{source} is not in commit {clone.commit[:8]}; leave --commit out to take the one tested")
+            raise DataError(f"{source} is not in commit {commit[:8]}; leave --commit out to take the one tested")
         report(Progress(task))
         try:
             if recording is None:

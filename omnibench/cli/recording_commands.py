@@ -166,18 +166,18 @@ def fetch(
         return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
-    clone, several = fetched.clone, len(fetched.datasets) > 1
+    several = len(fetched.datasets) > 1
     for folder, imported in fetched.datasets.items():
         warn(f"{folder}: {each}" if several else each for each in imported.warnings)
     for folder, imported in fetched.datasets.items():
         typer.echo(f"{plural(len(imported.trajectories), 'trajectory')}: {folder}")
-    first, dataset = next(iter(fetched.datasets.items()), (clone.folder, None))
+    first, dataset = next(iter(fetched.datasets.items()), (fetched.folder, None))
     licence = fetched.licence or "the repository states none; ask its authors before you use it"
     if fetched.licence_file is not None:
         licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
-    for line in (f"source: {fetched.source}, in {clone.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
+    for line in (f"source: {fetched.source}, in {fetched.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
         say(line)
-    holds = f"{clone.folder} holds {clone.repository}"
+    holds = f"{fetched.folder} holds {fetched.repository}"
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
         if several:
