@@ -7,7 +7,6 @@ runs that were not fitted, by the verdict of ``calibrate``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Set
-from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, Literal
@@ -20,15 +19,12 @@ from omnibench.check.misreadings import UNRELATED
 from omnibench.check.motions import lacking
 from omnibench.check.source import (
     RecordingSource,
-    command,
-    mended_options,
     odd_times,
     of_dataset,
     other_quantities,
     other_times,
     read_source,
     sensible,
-    with_fixes,
 )
 from omnibench.config import Model
 from omnibench.data.clock_matching import ClockMatch
@@ -145,18 +141,16 @@ def check_recording(read: RecordingSource) -> CheckReport:
         if hidden_by & {finding.kind for finding in found if finding.severity == "error"}:
             continue
         findings = [*find(evidence)]
-        if find is misreadings and not read.findings and any(finding.changes for finding in findings):
-            mended = read.read_by(mended_options(read, findings))
-            if mended is not None:
-                report = check_recording(replace(read, dataset=mended, findings=tuple(findings)))
-                return report.model_copy(update={"clocks": tuple(evidence.clocks)})
+        by_options = find is misreadings and not read.findings and any(finding.changes for finding in findings)
+        if by_options and (mended := read.mended(findings)) is not None:
+            return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
         found += [finding for finding in findings if finding not in read.findings]
     # Each finding of its kind and place once, those of the reading first.
     distinct: dict[tuple[str, str], Finding] = {}
     for finding in (*read.findings, *found):
         distinct.setdefault((finding.kind, finding.where), finding)
     ordered = sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
-    findings = with_fixes(read, ordered)
+    findings = read.with_fixes(ordered)
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
     misread = MISREAD & {each.kind for each in ordered if each.severity == "error" and each not in read.findings}
@@ -182,7 +176,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
         findings=tuple(findings),
         sentence=sentence,
         gain=gain,
-        command=command(read, typed),
+        command=read.command(typed),
         clocks=tuple(evidence.clocks),
     )
 
@@ -203,8 +197,8 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
     quantities: list[list[Finding]] = [[], *([finding] for finding in other_quantities(read))]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:
-        if findings and (other := read.read_by(mended_options(read, findings))) is not None and sensible(other):
-            return replace(read, dataset=other, findings=tuple(findings))
+        if findings and (other := read.mended(findings)) is not None and sensible(other.dataset):
+            return other
     return None
 
 

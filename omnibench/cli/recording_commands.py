@@ -209,7 +209,7 @@ def check(
     Nothing is changed. Exit 0: ready; 1: fix or record more; 2: the source cannot be read.
     """
     from omnibench.check.check import check_recording
-    from omnibench.check.source import next_command, read_source
+    from omnibench.check.source import read_source
     from omnibench.cli.terminal.recording_tables import print_check
     from omnibench.config import parse_settings
 
@@ -228,7 +228,7 @@ def check(
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
-        print_check(make_console(), checked, next_command(read))
+        print_check(make_console(), checked, read.next_command())
     if checked.verdict != "ready":
         raise typer.Exit(1)
 
