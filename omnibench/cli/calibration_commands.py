@@ -30,7 +30,7 @@ calibration_app = typer.Typer()
 def compare(
     config: list[Path] = argument(
         "Comparison config (YAML), or a data set (its folder, several, a glob) for a quick comparison.",
-        default=...,
+        ...,
         metavar="CONFIG|DATASET",
     ),
     output: Path | None = output_option(

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from omnibench.cli.options import FORCE, JSON, PLUGINS, argument, load_given_plugins, option, output_option
+from omnibench.cli import options as shared
+from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
@@ -60,7 +61,7 @@ def guide(
 def example(
     name: str | None = argument("One of the list that is shown without it."),
     output: Path | None = output_option("Folder to write to.", metavar="DIR"),
-    force: bool = FORCE,
+    force: bool = shared.FORCE,
 ) -> None:
     """Write an example to begin with, or list the examples.
 
@@ -110,7 +111,7 @@ _CONFIGS = {
 
 
 @guide_app.command("list")
-def list_(plugins: list[Path] | None = PLUGINS, as_json: bool = JSON) -> None:
+def list_(plugins: list[Path] | None = shared.PLUGINS, as_json: bool = shared.JSON) -> None:
     """List calibrators, costs, effects and importers.
 
     Each with where it comes from: built in, a plug-in's file, or an installed package.
@@ -119,9 +120,9 @@ def list_(plugins: list[Path] | None = PLUGINS, as_json: bool = JSON) -> None:
     from omnibench.registry import REGISTRIES, Entry
     from omnibench.report.blocks import Column, Row, Table
 
-    failures = load_given_plugins(plugins)
+    failures = shared.load_given_plugins(plugins)
     if as_json:
-        # All that a config can name, with the JSON schema of its options, and the plug-ins that failed.
+        # All that a config can name, with the shared.JSON schema of its options, and the plug-ins that failed.
         def row(entry: Entry[object]) -> dict[str, object]:
             options = entry.options.model_json_schema().get("properties", {})
             return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
@@ -147,20 +148,22 @@ def schema(
         "Which command's config.", default="compare"
     ),
 ) -> None:
-    """Print the JSON schema of a config, for editors."""
+    """Print the shared.JSON schema of a config, for editors."""
     module, name = _CONFIGS[kind]
     config: type[BaseModel] = getattr(import_module(module), name)
     print_json(config.model_json_schema(by_alias=True))
-    print_ending(f"this is the JSON schema of configs for {kind}", "write it to a file and name that in your editor")
+    print_ending(
+        f"this is the shared.JSON schema of configs for {kind}", "write it to a file and name that in your editor"
+    )
 
 
 @_plugin.command("new")
 def plugin_new(
-    name: str = argument("Name of the plug-in in configs.", default=...),
+    name: str = argument("Name of the plug-in in configs.", ...),
     kind: str | None = option("calibrator, importer, cost or effect. Default: calibrator.", metavar="KIND"),
-    effect: bool = option("Short for --kind effect.", "--effect", default=False),
+    effect: bool = flag("Short for --kind effect.", "--effect"),
     folder: Path = option("Folder to write to.", "--folder", "-o", "--output", default=Path("plugins"), metavar="DIR"),
-    force: bool = FORCE,
+    force: bool = shared.FORCE,
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.testing.plugin_files import new_plugin
@@ -176,7 +179,7 @@ def plugin_new(
 
 @_plugin.command("check")
 def plugin_check(
-    file: Path = argument("Plug-in file.", default=...),
+    file: Path = argument("Plug-in file.", ...),
     sample: Path | None = option("Sample recordings for an importer to read."),
     seconds: float = option("Longest time of the whole check, in s.", default=600.0, min=0.1),
 ) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from omnibench.cli.options import FORCE, PLUGINS, argument, load_given_plugins, option, output_option, plugin_folders
+from omnibench.cli import options as shared
+from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
@@ -31,15 +32,15 @@ _SECONDS = option("Stop after this time, in s. Default: on Ctrl-C.", min=0.0)
 
 @live_app.command()
 def live(
-    config: Path = argument("Config of the node (YAML).", default=...),
+    config: Path = argument("Config of the node (YAML).", ...),
     dataset: Path | None = argument(
         "With --replay: data set folder, or config with a simulated one. Default: the config's."
     ),
-    replay: bool = option("Play a recording to the node, show its errors, and end.", "--replay", default=False),
+    replay: bool = flag("Play a recording to the node, show its errors, and end.", "--replay"),
     speed: str | None = option("Speed of the replay: 1, 10, ... or max. Default: the config's."),
-    foxglove: bool = option("Serve Foxglove's WebSocket on this computer.", "--foxglove", default=False),
+    foxglove: bool = flag("Serve Foxglove's WebSocket on this computer.", "--foxglove"),
     seconds: float | None = _SECONDS,
-    plugins: list[Path] | None = PLUGINS,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Run the node: wheel samples in, odometry out, over Zenoh.
 
@@ -50,7 +51,7 @@ def live(
     if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
         config, dataset = dataset, config
     chosen = read_live_config(config)
-    chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *plugin_folders(plugins))})
+    chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *shared.plugin_folders(plugins))})
     if foxglove and not chosen.foxglove:
         chosen = chosen.model_copy(update={"foxglove": True})
     if not replay:
@@ -110,7 +111,7 @@ def _replay_to_node(
 
 @live_app.command()
 def replay(
-    dataset: Path = argument("Data set folder, or config with a simulated one.", default=...),
+    dataset: Path = argument("Data set folder, or config with a simulated one.", ...),
     robot: str = option("Name of the robot that is played.", default="robot"),
     speed: str = option("1: as recorded; 10: ten times as fast; max: as fast as can be.", default="1"),
     settings: list[str] | None = option(
@@ -121,7 +122,7 @@ def replay(
     connect: str | None = _CONNECT,
     profile: Profile | None = _PROFILE,
     seconds: float | None = _SECONDS,
-    plugins: list[Path] | None = PLUGINS,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would.
 
@@ -137,7 +138,7 @@ def replay(
     from omnibench.robot.calibration import read_calibration
 
     checked_robot(robot)
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     chosen = validate(ReplayConfig, {"speed": speed, **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     with ProgressDisplay() as watch:
@@ -162,7 +163,7 @@ def listen(
     connect: str | None = _CONNECT,
     profile: Profile | None = _PROFILE,
     seconds: float | None = _SECONDS,
-    as_json: bool = option("Print one JSON document a line, once a second.", "--json", default=False),
+    as_json: bool = flag("Print one shared.JSON document a line, once a second.", "--json"),
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
     from omnibench.cli.terminal.live_tables import listen as show
@@ -178,11 +179,11 @@ def listen(
 
 @live_app.command()
 def swap(
-    robot: str = argument("Name of the robot.", default=...),
-    calibration: Path = argument("Calibration file to run from now on.", default=...),
+    robot: str = argument("Name of the robot.", ...),
+    calibration: Path = argument("Calibration file to run from now on.", ...),
     config: Path | None = _CONFIG,
     connect: str | None = _CONNECT,
-    plugins: list[Path] | None = PLUGINS,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Give a running node another calibration, without a jump.
 
@@ -190,7 +191,7 @@ def swap(
     """
     from omnibench.live.control.query_server import swap_calibration
 
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):
         swapped = swap_calibration(session, robot, calibration)
     if not swapped.kept:
@@ -200,16 +201,14 @@ def swap(
 
 @live_app.command()
 def record(
-    robots: list[str] = argument(
-        "Names of robots, or the config of a node with them.", default=..., metavar="ROBOT...|CONFIG"
-    ),
+    robots: list[str] = argument("Names of robots, or the config of a node with them.", ..., metavar="ROBOT...|CONFIG"),
     output: Path = output_option("MCAP file to write.", default=..., metavar="FILE.mcap"),
     config: Path | None = _CONFIG,
     connect: str | None = _CONNECT,
     profile: Profile | None = _PROFILE,
     seconds: float | None = _SECONDS,
     topics: list[str] | None = option("Record only this topic; may be repeated. Default: all.", "--topic"),
-    force: bool = FORCE,
+    force: bool = shared.FORCE,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.live_tables import record as write
@@ -230,7 +229,7 @@ def record(
 
 @live_app.command()
 def keys(
-    folder: Path = argument("Folder to write to.", default=..., metavar="DIR"),
+    folder: Path = argument("Folder to write to.", ..., metavar="DIR"),
     names: list[str] | None = argument("Who gets a certificate. Default: node and client."),
     router: str | None = option(
         "Who of these runs the node that the others connect to. Default: node.", metavar="NAME"
@@ -239,8 +238,8 @@ def keys(
         "Name or address of the computer that this node runs on; may be repeated.", "--host"
     ),
     days: int = option("Validity, in days.", default=365, min=1),
-    users: bool = option("Also make passwords, and a users.txt for the node.", "--users", default=False),
-    force: bool = option("Replace files that exist, the authority (CA) too.", "--force", "--overwrite", default=False),
+    users: bool = flag("Also make passwords, and a users.txt for the node.", "--users"),
+    force: bool = flag("Replace files that exist, the authority (CA) too.", "--force", "--overwrite"),
 ) -> None:
     """Make a test authority (CA) and certificates for mutual TLS."""
     from omnibench.live.network.keys import make_keys

@@ -43,6 +43,11 @@ def argument(text: str, default: Any = None, **settings: Any) -> Any:
     return typer.Argument(default, help=text, **settings)
 
 
+def flag(text: str, *names: str) -> Any:
+    """An option without a value, which is False unless it is given. text: its help."""
+    return option(text, *names, default=False)
+
+
 def output_option(text: str, **settings: Any) -> Any:
     """``-o`` and ``--output``: the same two spellings for every command that writes files."""
     return option(text, "-o", "--output", **settings)
@@ -79,14 +84,12 @@ def _with_parameters(function: Callable[..., None], parameters: list[inspect.Par
     return function
 
 
-DATASET = argument("Data set folder.", default=...)
-DATASETS = argument(
-    "Data set folder; several of one robot, or a glob, count as one.", default=..., metavar="DATASET..."
-)
-CALIBRATION = argument("Calibration file.", default=...)
+DATASET = argument("Data set folder.", ...)
+DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
+CALIBRATION = argument("Calibration file.", ...)
 WHICH_DATASET = option("Name of the data set, if the config has several.")
-JSON = option("Print one JSON document on standard output, and nothing else.", "--json", default=False)
-FORCE = option("Replace what is there already.", "--force", default=False)
+JSON = flag("Print one JSON document on standard output, and nothing else.", "--json")
+FORCE = flag("Replace what is there already.", "--force")
 FIGURES = option("Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).", metavar="DIR")
 SETTINGS = option("Set an option, its value in YAML; may be repeated.", "--set", metavar="KEY=VALUE")
 TableFormat = Literal["parquet", "csv"]
@@ -285,8 +288,8 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
         least = least + 1 if kind is int and "exclusiveMinimum" in schema else least
-        flag = [f"--{name}"] if kind is bool else []
-        made = option(field.description or "", *flag, default=field.default, min=least)
+        names = [f"--{name}"] if kind is bool else []
+        made = option(field.description or "", *names, default=field.default, min=least)
         kind = kind | None if field.default is None else kind
         yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=kind)
 

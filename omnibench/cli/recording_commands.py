@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.options import argument, option, output_option
+from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -45,24 +45,20 @@ class HelpOfImporters(TyperCommand):
 @recording_app.command("import", cls=HelpOfImporters)
 def import_(
     importer: str = argument(
-        "Format of the recordings; import FORMAT --help shows its options.", default=..., metavar="FORMAT"
+        "Format of the recordings; import FORMAT --help shows its options.", ..., metavar="FORMAT"
     ),
     source: Path | None = argument("File or folder with the recordings."),
     output: Path | None = output_option("Data set folder to write."),
     settings: list[str] | None = shared.SETTINGS,
-    accept_units: bool = option(
-        "Write the data set even if units look wrong by magnitude.", "--accept-units", default=False
-    ),
+    accept_units: bool = flag("Write the data set even if units look wrong by magnitude.", "--accept-units"),
     template: Path | None = option("csv, without SOURCE: write tables and robot.yaml to fill in.", metavar="DIR"),
     robot_type: Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None = option(
         "With --template: the robot's type. Default: diff."
     ),
-    references: bool = option(
-        "With --template: distances and turned angles, measured by hand, instead of poses.",
-        "--references",
-        default=False,
+    references: bool = flag(
+        "With --template: distances and turned angles, measured by hand, instead of poses.", "--references"
     ),
-    no_check: bool = option("Leave out the check of what was recorded.", "--no-check", default=False),
+    no_check: bool = flag("Leave out the check of what was recorded.", "--no-check"),
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
@@ -193,7 +189,7 @@ def fetch(
 @shared.grouped
 def check(
     source: list[Path] = argument(
-        "Data set folder, or several; folder or file of CSV tables, or a bag.", default=..., metavar="SOURCE..."
+        "Data set folder, or several; folder or file of CSV tables, or a bag.", ..., metavar="SOURCE..."
     ),
     importer: str | None = option("Importer of the source. Default: by its files.", "--format", metavar="NAME"),
     robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
@@ -342,12 +338,10 @@ def design(
 @recording_app.command()
 @shared.grouped
 def slam(
-    dataset: Path = argument("Data set folder with laser scans.", default=...),
+    dataset: Path = argument("Data set folder with laser scans.", ...),
     output: Path | None = output_option("Data set folder to write, with the new poses."),
     start: Literal["odometry", "last_pose"] | None = option("First guess of each scan's pose. Default: odometry."),
-    no_deskew: bool = option(
-        "Leave out the correction for the robot's motion during a scan.", "--no-deskew", default=False
-    ),
+    no_deskew: bool = flag("Leave out the correction for the robot's motion during a scan.", "--no-deskew"),
     model: Path | None = option("Calibration for that odometry. Default: the design values.", metavar="CALIBRATION"),
     truth: Path | None = option("Folder that simulate --truth wrote: show the errors against it.", metavar="DIR"),
     page: shared.ReportOptions = shared.report_options("Write a page with figures of scans, paths and wheels."),
@@ -412,7 +406,7 @@ def simulate(
     ),
     like: Path | None = option("Instead of CONFIG: drive this data set's recorded wheel rates.", metavar="DATASET"),
     model: Path | None = option("With --like: the true model, a calibration file.", metavar="CALIBRATION"),
-    noise: bool = option("With --like: add the noise that the calibration states.", "--noise", default=False),
+    noise: bool = flag("With --like: add the noise that the calibration states.", "--noise"),
     seed: int | None = option("With --noise: its seed. Default: 0.", min=0),
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
