@@ -122,7 +122,7 @@ def list_(plugins: list[Path] | None = shared.PLUGINS, as_json: bool = shared.JS
 
     failures = shared.load_given_plugins(plugins)
     if as_json:
-        # All that a config can name, with the shared.JSON schema of its options, and the plug-ins that failed.
+        # All that a config can name, with the JSON schema of its options, and the plug-ins that failed.
         def row(entry: Entry[object]) -> dict[str, object]:
             options = entry.options.model_json_schema().get("properties", {})
             return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
@@ -148,13 +148,11 @@ def schema(
         "Which command's config.", default="compare"
     ),
 ) -> None:
-    """Print the shared.JSON schema of a config, for editors."""
+    """Print the JSON schema of a config, for editors."""
     module, name = _CONFIGS[kind]
     config: type[BaseModel] = getattr(import_module(module), name)
     print_json(config.model_json_schema(by_alias=True))
-    print_ending(
-        f"this is the shared.JSON schema of configs for {kind}", "write it to a file and name that in your editor"
-    )
+    print_ending(f"this is the JSON schema of configs for {kind}", "write it to a file and name that in your editor")
 
 
 @_plugin.command("new")

@@ -163,7 +163,7 @@ def listen(
     connect: str | None = _CONNECT,
     profile: Profile | None = _PROFILE,
     seconds: float | None = _SECONDS,
-    as_json: bool = flag("Print one shared.JSON document a line, once a second.", "--json"),
+    as_json: bool = flag("Print one JSON document a line, once a second.", "--json"),
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
     from omnibench.cli.terminal.live_tables import listen as show
