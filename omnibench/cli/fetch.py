@@ -32,6 +32,7 @@ from omnibench.registry import importers, load_plugin_file
 from omnibench.slam.import_dataset import import_dataset
 
 GITHUB = "https://github.com"
+NEWEST = "HEAD"  # instead of a commit: the newest one, or of a clone that is there the one checked out
 
 # GitHub's rules for names, and a repository's address where one is pasted.
 _REPOSITORY = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]*/(?!\.{1,2}$)[A-Za-z0-9._][A-Za-z0-9._-]*")
@@ -46,8 +47,8 @@ class PublicDataset(Model):
 
     name: str
     path: str
-    robot: str
-    runs: str
+    robot: str = ""
+    runs: str = ""
     options: dict[str, Any] = {}
 
 
@@ -60,11 +61,11 @@ class PublicRecording(Model):
 
     name: str
     repository: str
-    commit: str
-    licence: str
-    reference: str
+    commit: str = NEWEST
+    licence: str = ""
+    reference: str = ""
     article: str = ""
-    importer: str
+    importer: str = ""
     plugin: str = ""
     datasets: tuple[PublicDataset, ...]
 
@@ -73,48 +74,35 @@ class _Catalogue(Model):
     recordings: tuple[PublicRecording, ...]
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A repository of GitHub, and what of it is wanted.
-
-    recording: None for a repository that the catalogue does not hold; all of it is then one data set.
-    """
-
-    repository: str
-    recording: PublicRecording | None
-    datasets: tuple[PublicDataset, ...]
-
-
 RECORDINGS = read_model(_Catalogue, Path(__file__).with_name("recordings.yaml")).recordings
 
 
-def find_recording(name: str) -> Asked:
+def find_recording(name: str) -> PublicRecording:
     """The recording of a name: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
 
-    ConfigError names the nearest known name and lists all.
+    One that the catalogue does not hold has no importer, and is one data set. ConfigError names the nearest known name
+    and lists all.
     """
-    known: dict[str, Asked] = {}
-    by_repository: dict[str, Asked] = {}
+    known: dict[str, PublicRecording] = {}
+    by_repository: dict[str, PublicRecording] = {}
     for recording in RECORDINGS:
         for dataset in recording.datasets:
-            one = Asked(recording.repository, recording, (dataset,))
+            one = recording.model_copy(update={"datasets": (dataset,)})
             known |= {dataset.name: one, f"{recording.name}/{dataset.name}": one}
-        whole = Asked(recording.repository, recording, recording.datasets)
-        known[recording.name] = by_repository[recording.repository.lower()] = whole
+        known[recording.name] = by_repository[recording.repository.lower()] = recording
     repository = _ADDRESS.sub("", name)
     if (asked := known.get(name) or by_repository.get(repository.lower())) is not None:
         return asked
     owner = repository.partition("/")[0]
     if _REPOSITORY.fullmatch(repository) and owner not in {recording.name for recording in RECORDINGS}:
-        return Asked(repository, None, (PublicDataset(name=repository.partition("/")[2], path=".", robot="", runs=""),))
+        whole = PublicDataset(name=repository.partition("/")[2], path=".")
+        return PublicRecording(name=repository, repository=repository, datasets=(whole,))
     short = [each for each in known if "/" not in each]
     raise ConfigError(
         f"fetch: unknown recording {name!r}; {nearest(name, known)}known: {', '.join(sorted(short))}, and any "
         "OWNER/REPO on GitHub"
     )
 
-
-NEWEST = "HEAD"  # instead of a commit: the newest one, or of a clone that is there the one checked out
 
 _PATIENCE = 10.0  # s for git to end after it was told to; chosen
 # A connection on which hardly anything comes for a minute is given up: bytes per s, and s; chosen.
@@ -319,32 +307,29 @@ def fetch_recording(
     for folder in folders:
         check_dataset_folder(folder)
     refuse_existing(*folders, force=force, folders=True)
-    recording = asked.recording
     place = CLONES / asked.repository
-    commit = open_clone(asked.repository, place, commit or (recording.commit if recording else NEWEST), report)
-    file = _licence_file(place)
-    cite, licence, importer = f"{GITHUB}/{asked.repository}", "", ""
-    if recording is not None:
-        cite, licence, importer = recording.article or cite, recording.licence, recording.importer
-        # The importer is the catalogue's plug-in, unless one of that name is there.
-        if recording.plugin and importer not in [entry.name for entry in importers.entries()]:
-            failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
-            if failure is not None:
-                raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
-    elif file is not None:
+    commit = open_clone(asked.repository, place, commit or asked.commit, report)
+    # The importer is the catalogue's plug-in, unless one of that name is there.
+    if asked.plugin and asked.importer not in [entry.name for entry in importers.entries()]:
+        failure = load_plugin_file(bundled_folder() / "plugins" / asked.plugin)
+        if failure is not None:
+            raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
+    licence, file = asked.licence, _licence_file(place)
+    if not asked.importer and file is not None:
         # A licence's title is the first line of its text.
         text = file.read_text(encoding="utf-8", errors="replace")
         licence = next((line.strip()[:_LONGEST] for line in text.split("\n") if line.strip()), "")
-    fetched = Fetched(asked.repository, place, commit, cite, licence, file, {}, importer=importer)
+    cite = asked.article or f"{GITHUB}/{asked.repository}"
+    fetched = Fetched(asked.repository, place, commit, cite, licence, file, {}, importer=asked.importer)
     imported = dict[Path, Dataset]()
     for folder, asked_dataset in zip(folders, asked.datasets, strict=True):
-        task = f"importing {asked_dataset.name}" if recording else "importing"
+        task = f"importing {asked_dataset.name}" if asked.importer else "importing"
         source = place / asked_dataset.path
         if not source.exists():
             raise DataError(f"{source} is not in commit {commit[:8]}; leave --commit out to take the one tested")
         report(Progress(task))
         try:
-            if recording is None:
+            if not asked.importer:
                 fetched = replace(fetched, importer=recognised(source))
             # The importer's options hold origin and licence where they can, to be kept when it is imported again.
             origin = {"name": folder.resolve().name, "source": fetched.source, "licence": licence}
@@ -352,11 +337,11 @@ def fetch_recording(
             given = {key: text for key, text in origin.items() if key in fields and text and text.isprintable()}
             dataset = import_dataset(fetched.importer, source, {**given, **asked_dataset.options})
             dataset = replace(dataset, source=fetched.source, licence=licence or dataset.licence)
-            mistakes = search(recorded(dataset)).mistakes if recording is None else ()
+            mistakes = () if asked.importer else search(recorded(dataset)).mistakes
             if wrong := [mistake.what for mistake in mistakes if mistake.kind in UNITS]:
                 raise DataError("; ".join(wrong))
         except (ConfigError, DataError) as refusal:
-            if recording is not None:
+            if asked.importer:
                 raise
             return replace(fetched, refusal=str(refusal))
         finally:
