@@ -17,15 +17,7 @@ from omnibench.check import faults
 from omnibench.check.evidence import Evidence
 from omnibench.check.misreadings import UNRELATED
 from omnibench.check.motions import lacking
-from omnibench.check.source import (
-    RecordingSource,
-    odd_times,
-    of_dataset,
-    other_quantities,
-    other_times,
-    read_source,
-    sensible,
-)
+from omnibench.check.source import RecordingSource, odd_times, of_dataset, other_times, read_source, sensible
 from omnibench.config import Model
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset
@@ -194,7 +186,7 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
             return None
         if [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
             return None
-    quantities: list[list[Finding]] = [[], *([finding] for finding in other_quantities(read))]
+    quantities: list[list[Finding]] = [[], *([finding] for finding in read.other_quantities())]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:
         if findings and (other := read.mended(findings)) is not None and sensible(other.dataset):

@@ -19,21 +19,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.check.hypotheses import (
-    IN_DEGREES,
-    Hypothesis,
-    Reading,
-    another_mount,
-    design_hypotheses,
-    mirrored_positions,
-    plain_hypothesis,
-    position_units,
-    reference_hypotheses,
-    steering_readings,
-    steering_scales,
-    turned_reference,
-    wheel_hypotheses,
-)
+from omnibench.check import hypotheses as readings
+from omnibench.check.hypotheses import Hypothesis, Reading
 from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed, usual_changes
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array, CarDrive, Robot, wrapped
@@ -218,7 +205,7 @@ def _other_kinds(best: Sequence[Finding], others: Sequence[tuple[Finding, ...]])
 def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     """The scores of all hypotheses, without those of fits whose residual alone is beyond any explanation."""
     weight, best = min(fit.windows / _CORRELATED, _MOST_WEIGHED), math.inf
-    every = list(wheel_hypotheses(recording.robot, counted=recording.counted))
+    every = list(readings.wheel_hypotheses(recording.robot, counted=recording.counted))
     transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
     for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
         residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.unexplained.min())
@@ -247,19 +234,19 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
         yield robot, wheels
         if base.exclusive:
             return
-        for unit in position_units():
+        for unit in readings.position_units():
             yield robot, [wheel.with_reference(unit) for wheel in simple]
         turned = [
             wheel.with_reference(reference)
             for wheel in simple
             if not wheel.mistakes or wheel.mistakes[0].kind != "wheels_swapped"
-            if (reference := turned_reference(robot, base.fit, wheel.columns)) is not None
+            if (reference := readings.turned_reference(robot, base.fit, wheel.columns)) is not None
         ]
         if turned:
             yield robot, turned
-        for hypothesis in () if base.mistakes else design_hypotheses(robot, base.fit):
+        for hypothesis in () if base.mistakes else readings.design_hypotheses(robot, base.fit):
             yield hypothesis.robot or robot, [hypothesis]
-    for mirrored in reference_hypotheses(base.flipped):
+    for mirrored in readings.reference_hypotheses(base.flipped):
         yield robot, [wheel.with_reference(mirrored) for wheel in simple]
 
 
@@ -274,11 +261,11 @@ def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> I
     read_as: list[tuple[Recorded, tuple[Finding, ...], float]] = [(recording, (), 0.0)]
     for factor in (1.0, -1.0):
         if (base := degrees.with_headings(factor).fit()) is not None:
-            yield _Base(base, (IN_DEGREES,), cost, flipped=factor < 0)
+            yield _Base(base, (readings.IN_DEGREES,), cost, flipped=factor < 0)
             if factor > 0 and (beyond or base.unexplained[1] < fit.unexplained[1] / 2):
-                read_as.append((degrees, (IN_DEGREES,), cost))
+                read_as.append((degrees, (readings.IN_DEGREES,), cost))
     for read, mistakes, more in read_as:
-        for hypothesis in (*wheels, *steering_readings(read.robot, read.logs, read.poses)):
+        for hypothesis in (*wheels, *readings.steering_readings(read.robot, read.logs, read.poses)):
             if (base := read.meant(hypothesis).fit()) is not None:
                 yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, exclusive=True)
 
@@ -288,19 +275,19 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not any(log.rates.any() for log in recording.logs):
         return Explained()
     positions, robot, moments = recording.without_headings, recording.robot, _Moments.of(recording)
-    plain = plain_hypothesis(robot)
+    plain = readings.plain_hypothesis(robot)
     present = float(moments.misfits([plain])[0])
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         contradicting = _contradicting(recording)
         return moments.off_centre() if positions and not contradicting else Explained(contradicting)
     hypotheses = list(_sparse_hypotheses(recording))
     if positions:
-        hypotheses.append(plain.with_reference(mirrored_positions()))
+        hypotheses.append(plain.with_reference(readings.mirrored_positions()))
     scored = []
-    for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))[: 1 if positions else 2]:
+    for radian, headings in ((1.0, ()), (math.pi / 180, (readings.IN_DEGREES,)))[: 1 if positions else 2]:
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
-    for hypothesis in steering_scales(robot):
+    for hypothesis in readings.steering_scales(robot):
         misfits = _Moments.of(recording.meant(hypothesis)).misfits([plain])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
     if present <= _MISFIT and not positions:  # another design misses by as much: only steering is judged
@@ -325,7 +312,7 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     present = far.contradictions(gram, np.eye(len(gram))[None])[0]
     if present <= _CONTRADICTING / 3:
         return ()
-    linear = [hypothesis for hypothesis in wheel_hypotheses(recording.robot) if hypothesis.reading is None]
+    linear = [hypothesis for hypothesis in readings.wheel_hypotheses(recording.robot) if hypothesis.reading is None]
     keys = [[key for mistake in hypothesis.mistakes for key in mistake.changes] for hypothesis in linear]
     steering = [each for each, changed in zip(linear, keys, strict=True) if "steering" in " ".join(changed)]
     shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
@@ -340,13 +327,13 @@ def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
     design.
     """
     wheels = []
-    for wheel in wheel_hypotheses(recording.robot, counted=recording.counted):
+    for wheel in readings.wheel_hypotheses(recording.robot, counted=recording.counted):
         scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
         small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
         if wheel.reading is None and not small:
             wheels.append(wheel)
     yield from wheels
-    for unit in position_units():
+    for unit in readings.position_units():
         for wheel in wheels:
             if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit":
                 yield wheel.with_reference(unit)
@@ -440,14 +427,14 @@ class _Moments:
         values, cost, error = max(likely, key=lambda point: float(point[0][count]))  # trackers mostly stand ahead
         without, dearer, _ = self._fitted(nothing, deviation, count)
         close = max(self._missed(values), exact) < _REMAINS * self._missed(without)
-        mistake = another_mount(robot, values[count:])
+        mistake = readings.another_mount(robot, values[count:])
         if mistake is None or not close or dearer - cost < _FITTED_POINT or error > np.hypot(*values[count:]) / 2:
             return Explained()
         distinct, alike = [values[count:]], list[tuple[Finding, ...]]()
         for point in (other[count:] for other, _, _ in likely):
             apart = min(np.hypot(*(point - other)) for other in distinct) > _APART * reach
             distinct += [point] if apart else []
-            if apart and (other := another_mount(robot, point)) is not None:
+            if apart and (other := readings.another_mount(robot, point)) is not None:
                 words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
                 alike.append((other.model_copy(update={"what": words}),))
         return Explained((mistake,), tuple(alike))

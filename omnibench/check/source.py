@@ -91,6 +91,18 @@ class RecordingSource:
         except (DataError, ConfigError):
             return None
 
+    def other_quantities(self) -> Iterator[Finding]:
+        """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
+        if self.reading is None or not (quantities := {each.wheels.unit for each in self.reading[0]}):
+            return
+        present = min(quantities)
+        unit = present.partition("/")[0]
+        names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
+        for ending, quantity in names.items():
+            if unit != "rpm" and (other := f"{unit}{ending}") != present:
+                what = f"the wheels look like {quantity} ({other}); read as {quantity_of(present)} ({present})"
+                yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
+
     def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
         """The recording as these findings mend it, which it then has; None if it cannot be read so."""
         dataset = self.read_by(self.mended_options(findings))
@@ -348,19 +360,6 @@ def _geared(read: RecordingSource, options: Mapping[str, Any], factors: Sequence
 
 def _unit_of_wheels(read: RecordingSource, options: Mapping[str, Any]) -> str:
     return str(options.get("wheel_unit") or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
-
-
-def other_quantities(read: RecordingSource) -> Iterator[Finding]:
-    """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
-    if read.reading is None or not (quantities := {each.wheels.unit for each in read.reading[0]}):
-        return
-    present = sorted(quantities)[0]
-    unit = present.partition("/")[0]
-    names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
-    for ending, quantity in names.items():
-        if unit != "rpm" and (other := f"{unit}{ending}") != present:
-            what = f"the wheels look like {quantity} ({other}); read as {quantity_of(present)} ({present})"
-            yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
 
 
 def _listed(present: Any, count: int, default: float) -> list[float]:
