@@ -76,13 +76,6 @@ def scan_table(file: Path) -> tuple[int, pl.LazyFrame]:
     return rows, frame
 
 
-def read_parquet(file: Path) -> pl.DataFrame:
-    """A whole Parquet file. DataError as for scan_table."""
-    _, frame = scan_table(file)
-    with readable(file):
-        return frame.collect()
-
-
 def seconds(place: int, kind: pl.DataType) -> pl.Expr:
     """A column by its index; one of dates or durations in seconds."""
     column = pl.nth(place)
