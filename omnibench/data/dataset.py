@@ -381,10 +381,9 @@ def check_runs(runs: Table) -> Table:
     for column in runs.frame.columns:
         if column in (*RUN_NUMBERS, "repetition"):
             values = runs.floats(column)
-            infinite = ~values.is_finite() & values.is_not_null()
-            runs.refuse(infinite, f"{column} is {{}}; leave it empty if it is not known", values)
-            fraction = (values % 1 != 0) if column == "repetition" else infinite
-            runs.refuse(fraction, f"{column} is {{}}, not a whole number", values)
+            runs.refuse(~values.is_finite(), f"{column} is {{}}; leave it empty if it is not known", values)
+            if column == "repetition":
+                runs.refuse(values % 1 != 0, "repetition is {}, not a whole number", values)
             runs.frame = runs.frame.with_columns(values.alias(column))
     ids, splits = runs.frame["trajectory"], runs.frame["split"]
     runs.refuse(~ids.is_first_distinct(), "trajectory {} is there twice; give each its own id", ids)
@@ -415,16 +414,12 @@ def runs_of_tables(
         numbers = {name: np.full(len(references.frame), np.nan) for name in NUMBERS}
         for name in [name for name in NUMBERS if name in references.frame.columns]:
             numbers[name] = references.floats(name).fill_null(np.nan).to_numpy()
-            if name in ("t0", "t1"):
-                infinite = np.isinf(numbers[name])
-                references.refuse(infinite, f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
+            infinite = np.isinf(numbers[name])
+            references.refuse(infinite, f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
         kinds = np.array(["" if kind is None else str(kind).strip() for kind in references.frame["kind"]], dtype=str)
         for index, rows in references.rows_by_run(runs.ids, runs.file.name):
-            run, of_rows, end = (
-                runs.ids[index],
-                {name: values[rows] for name, values in numbers.items()},
-                samples[index].end,
-            )
+            run, end = runs.ids[index], samples[index].end
+            of_rows = {name: values[rows] for name, values in numbers.items()}
             of_run = references_of(kinds[rows], of_rows, start_known=run in started).of_run(0.0, end)
             if (wrong := reference_flaw(of_run, end)) is not None:
                 raise references.fail(int(rows[wrong[0]]), wrong[1])
@@ -484,16 +479,12 @@ def checked(dataset: Dataset) -> Dataset:
             standing += [each.id] if driven.sum(axis=0).max() < _HARDLY * moved[far].max() else []
         each.samples.summarise()  # while they are at hand
     period, (shortest, longest) = stored.median_period(runs), SAMPLE_PERIODS
+    odd = f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
     if not period / _MOST_PERIODS < sample_period < period * _MOST_PERIODS:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the "
-            f"median); set it to {period:.3g}"
-        )
+        raise DataError(f"{place}: {odd}; set it to {period:.3g}")
     if not shortest <= sample_period <= longest:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
-            "check the units of the times"
-        )
+        expected = f"expected {shortest:g} to {longest:g} s; check the units of the times"
+        raise DataError(f"{place}: sample_period is {sample_period:g} s, {expected}")
     recorded = [run.poses[:, 2] for run in runs]
     headings, ambiguous = unwrap(robot, [run.log(run.pose_times) for run in runs], recorded)
     # Wrapped headings lie within a turn, and continuous ones need no turns: others are in degrees, say.
@@ -502,31 +493,24 @@ def checked(dataset: Dataset) -> Dataset:
         for run, before, after in zip(runs, recorded, headings, strict=True)
         if np.ptp(before) > _WITHIN * TURN and not np.array_equal(before, after)
     ]
-    warnings = []
     if len(contradicted) > _CONTRADICTED * sum(run.has_poses for run in runs):
         headings, ambiguous, standing = recorded, [], []  # in other units runs seem to move too far
-        warnings.append(
-            f"headings of {plural(len(contradicted), 'trajectory')} turn otherwise than the wheels, so that all stay "
-            f"as they were recorded: {some(contradicted, _SHOWN)}"
-        )
-    if ambiguous:
-        warnings.append(
-            f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
-            f"{some([runs[index].id for index in ambiguous], _SHOWN)}"
-        )
-    if 0 < len(standing) < moving:
-        warnings.append(
-            f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
-            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {some(standing, _SHOWN)}"
-        )
+    else:
+        contradicted = []
     late = [run.id for run in runs if run.pose_times[-1] > run.samples.end * (1 + 1.5 / run.samples.count)]
-    if late:
-        have = "has reference poses after its" if len(late) == 1 else "have reference poses after their"
-        warnings.append(f"{plural(len(late), 'trajectory')} {have} last wheel sample, e.g. {some(late, _SHOWN)}")
+    concerned = {
+        "headings of {} turn otherwise than the wheels, so that all stay as they were recorded": contradicted,
+        "headings of {} may be unwrapped wrongly (reference too sparse)": [runs[index].id for index in ambiguous],
+        "the reference moves in {} though no wheel turns, which spoils every fit; leave them out": (
+            standing if len(standing) < moving else []
+        ),
+        "{} with reference poses after the last wheel sample": late,
+    }
+    warnings = [
+        f"{what.format(plural(len(ids), 'trajectory'))}: {some(ids, _SHOWN)}" for what, ids in concerned.items() if ids
+    ]
     if not 0.5 < period / sample_period < 2:
-        warnings.append(
-            f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
-        )
+        warnings.append(odd)
     for index, (run, before, heading) in enumerate(zip(runs, recorded, headings, strict=True)):
         if heading is not before:  # poses that stay need no memory for a copy
             run = replace(run, poses=np.column_stack([run.poses[:, :2], heading]))
@@ -538,9 +522,8 @@ def checked(dataset: Dataset) -> Dataset:
 def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
     """The data set with more warnings, each once, and with one about copies in its validation split."""
     warnings = list(dict.fromkeys([*dataset.warnings, *warnings]))
-    if copies := dataset.copies:
-        are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
-        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {some(copies, _SHOWN)}")
+    if dataset.copies:
+        warnings.append(f"left out of validation, as copies of training runs: {some(dataset.copies, _SHOWN)}")
     return replace(dataset, warnings=tuple(warnings))
 
 
