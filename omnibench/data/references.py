@@ -79,16 +79,12 @@ class References(Brief):
         for each in given:
             require_type(each, Reference, "Reference(kind, value, sigma)")
         kinds = np.array([each.kind for each in given], dtype=str)
-        # As of a run to come: -inf is its start, inf its end, and in the place of t0 the same time as t1.
-        starts = [np.inf if each.kind in AT_ONE_TIME else -np.inf for each in given]
-        t0 = [start if each.t0 is None else each.t0 for each, start in zip(given, starts, strict=True)]
-        t1 = [np.inf if each.t1 is None else each.t1 for each in given]
-        pairs = [(np.resize(each.value, 2), np.resize(each.sigma, 2)) for each in given]  # one number stands for both
-        values, sigmas = np.array(pairs, dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
-        times = np.array([t0, t1], dtype=float)
-        measured = cls(kinds, times[0], times[1], values, sigmas, start_known, rate_sigma)
-        values[~measured.planar, 1] = sigmas[~measured.planar, 1] = np.nan
-        return measured.of_run(0.0, end).by_time()
+        times = np.array([(each.t0, each.t1) for each in given], dtype=float).reshape(-1, 2).T  # NaN for None
+        values = np.array([np.resize(each.value, 2) for each in given], dtype=float).reshape(-1, 2).T
+        sigmas = np.array([np.resize(each.sigma, 2) for each in given], dtype=float).reshape(-1, 2).T
+        rows = (*times, values[0], *values, sigmas[0], *sigmas, np.zeros(len(given)))  # one number stands for both
+        measured = references_of(kinds, dict(zip(NUMBERS, rows, strict=True)), start_known=start_known)
+        return replace(measured, rate_sigma=rate_sigma).of_run(0.0, end).by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -186,13 +182,10 @@ def _flaw_of_row(
         return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
     if end is not None:
         for name, value in (("t0", t0), ("t1", t1)):
-            if not np.isfinite(value):
-                return f"{name} is {value}; remove or repair the row"
-            if value < 0:
-                return f"{name} is {value:g}; it must not be negative (s since the run's start)"
+            if not 0 <= value < np.inf:
+                return f"{name} is {value:g}; s since the run's start, finite and not negative"
         if t1 > end + LATE:
-            late = f"t1 is {t1:g}, after the run's last wheel sample at {end:g} s"
-            return f"{late}; check the clocks, or leave the row out"
+            return f"t1 is {t1:g}, after the last wheel sample at {end:g} s; check the clocks, or leave the row out"
         if kind == "position" and t0 != t1:
             return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
         if kind == "heading" and t0 not in (0.0, t1):
@@ -203,12 +196,11 @@ def _flaw_of_row(
     for axis, value, sigma in zip(axes, values, sigmas, strict=False):
         if np.isnan(value):
             return f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
-        if np.isnan(sigma):
-            return f"sigma{axis} is missing: how exactly the {kind} is known, a standard deviation"
         if not abs(value) <= LARGEST:
             return f"value{axis} is {value:g}, which no robot can reach; check the units"
         if not 0 < sigma <= LARGEST:
-            return f"sigma{axis} is {sigma:g}; a standard deviation is > 0 (how exactly the {kind} is known)"
+            stated = "missing" if np.isnan(sigma) else f"{sigma:g}"
+            return f"sigma{axis} is {stated}; a standard deviation is > 0 (how exactly the {kind} is known)"
     if kind == "distance" and values[0] < 0:
         return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
     return ""

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -25,7 +24,7 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, sink_frames
-from omnibench.data.stored import Rows, Table, check_columns, times_flaw
+from omnibench.data.stored import Rows, Table, check_columns, refuse, times_flaw
 from omnibench.errors import DataError
 from omnibench.files import TableFormat, check_file, unquoted_formulas
 from omnibench.robot.kinematics import Array
@@ -224,17 +223,12 @@ class ScansOnDisk(Scans):
             limits = f"from {self.scanner.range_min:g} to {self.scanner.range_max:g} m"
             way = "they look like mm, give m" if in_millimetres else "remove the row"
             what = f"the scan of trajectory {trajectory} at {times[row]:g} s is empty: no range {limits}; {way}"
-            raise DataError(f"{self.file}, row {rows[row] + 1}: {what}")
+            refuse(self.file, rows, empty, what)
         return ranges
 
     def _read(self, rows: Rows) -> Ranges:
         """The ranges (n, R) of some rows; DataError: they are not as many numbers as the scanner has rays."""
-
-        def refuse(faulty: Any, what: str, values: Any = ()) -> None:
-            for index in np.flatnonzero(faulty)[:1].tolist():
-                shown = what.format(values[index]) if len(values) else what
-                raise DataError(f"{self.file}, row {rows[index] + 1}: {shown}")
-
+        wrong = partial(refuse, self.file, rows)
         first, last, rays = int(rows[0]), int(rows[-1]), self.scanner.rays
         with readable(self.file):
             column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"][rows - first]
@@ -244,13 +238,13 @@ class ScansOnDisk(Scans):
             texts = column.str.strip_chars().str.split(" ")
             column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
             broken = texts.list.len() != column.list.drop_nulls().list.len()
-            refuse(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
+            wrong(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
         if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
             raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
         lengths = column.list.len().fill_null(0).to_numpy()
-        refuse(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
+        wrong(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths.tolist())
         ranges: Ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
-        refuse(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
+        wrong(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
         return ranges
 
 
@@ -259,22 +253,18 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
 
     Ranges are written in single precision. DataError: scans cannot be read. OSError: the disk refuses.
     """
-    recorded = set(scans.trajectories)
-    chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
     as_text = table_format == "csv"
 
-    ranges = pl.String() if as_text else pl.List(pl.Float32)
-    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges}
-    frames = (frame for trajectory in chosen for frame in _frames(trajectory, scans.of(trajectory), as_text))
-    sink_frames(frames, types, table_format, _ROW_GROUP, file)
+    def frames() -> Iterator[pl.DataFrame]:
+        for trajectory in (name for name in trajectories if name in scans.trajectories):
+            of_run = scans.of(trajectory)
+            for first in range(0, len(of_run.times), _ROW_GROUP):
+                part = slice(first, first + _ROW_GROUP)
+                ranges = pl.Series(np.asarray(of_run.ranges[part], dtype=np.float32)).arr.to_list()
+                if as_text:
+                    ranges = ranges.cast(pl.List(pl.String)).list.join(" ")
+                yield pl.DataFrame({"trajectory": trajectory, "t": of_run.times[part], "ranges": ranges}, schema=types)
+            del of_run  # before the next one's are read
 
-
-def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
-    for first in range(0, len(scans.times), _ROW_GROUP):
-        part = slice(first, first + _ROW_GROUP)
-        times, ranges = scans.times[part], np.asarray(scans.ranges[part], dtype=np.float32)
-        columns = {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges}
-        frame = pl.DataFrame(columns).with_columns(pl.col("ranges").arr.to_list(), pl.col("t").cast(pl.Float64))
-        if as_text:
-            frame = frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" "))
-        yield frame
+    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": pl.String() if as_text else pl.List(pl.Float32)}
+    sink_frames(frames(), types, table_format, _ROW_GROUP, file)

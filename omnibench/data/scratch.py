@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pickle
 import weakref
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,66 +28,53 @@ def temporary_file(ending: str) -> Any:
 
 
 class Scratch:
-    """A temporary file that objects are appended to."""
+    """A temporary file that objects are appended to; a copy in another process only reads it."""
 
-    def __init__(self) -> None:
-        self._file = temporary_file(".scratch")
+    def __init__(self, path: Path | None = None) -> None:
+        if path is None:
+            self._file = temporary_file(".scratch")
+        self._path = path or Path(self._file.name)
 
-    def stored(self, value: T) -> Stored[T]:
-        """The value, which from now on lies in the file. DataError: the disk refuses."""
-        path, offset = Path(self._file.name), self._file.tell()
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Scratch, (self._path,)
+
+    def stored(self, value: T) -> Callable[[], T]:
+        """A function that reads the value, which from now on lies in the file. DataError: the disk refuses."""
+        offset = self._file.tell()
         try:
             pickle.dump(value, self._file, protocol=pickle.HIGHEST_PROTOCOL)
             self._file.flush()
         except OSError as error:
             way = "set TMPDIR to a folder with more space"
-            raise DataError(f"{path}: cannot be written: {error.strerror or error}; {way}") from None
-        return Stored(path, offset, self)
+            raise DataError(f"{self._path}: cannot be written: {error.strerror or error}; {way}") from None
+        return partial(self._read, offset)
 
-    def sequence(self, values: Iterable[T]) -> StoredSequence[T]:
-        """The values, of which one is in memory at a time."""
-        return StoredSequence(tuple(self.stored(value) for value in values))
-
-
-@dataclass(frozen=True)
-class Stored(Generic[T]):
-    """An object in a temporary file, which a call reads. scratch: keeps the file, in the process that made it."""
-
-    path: Path
-    offset: int
-    scratch: Scratch | None = field(default=None, repr=False, compare=False)
-
-    def __call__(self) -> T:
-        """The object. DataError: the file is gone."""
+    def _read(self, offset: int) -> Any:
+        """The object at an offset. DataError: the file is gone."""
         try:
-            with self.path.open("rb") as file:
-                file.seek(self.offset)
-                value: T = pickle.load(file)
+            with self._path.open("rb") as file:
+                file.seek(offset)
+                value = pickle.load(file)
         except OSError as error:
             way = "the process that imports it has ended: save the data set, and load that"
-            raise DataError(f"{self.path}: cannot be read: {error.strerror or error}; {way}") from None
+            raise DataError(f"{self._path}: cannot be read: {error.strerror or error}; {way}") from None
         if isinstance(value, np.ndarray):  # with NumPy's own object for its type, so that asarray passes it on
             return value.view(np.dtype(value.dtype.str))
         return value
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Stored, (self.path, self.offset)
+    def sequence(self, values: Iterable[T]) -> StoredSequence[T]:
+        """The values, of which one is in memory at a time."""
+        return StoredSequence([self.stored(value) for value in values])
 
 
-@dataclass(frozen=True)
 class StoredSequence(Sequence[T]):
     """Objects in a temporary file, each of which is read whenever it is asked for."""
 
-    items: tuple[Stored[T], ...]
+    def __init__(self, items: Sequence[Callable[[], T]]) -> None:
+        self._items = items
 
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[T]: ...
-
-    def __getitem__(self, index: int | slice) -> T | Sequence[T]:
-        return StoredSequence(self.items[index]) if isinstance(index, slice) else self.items[index]()
+    def __getitem__(self, index: Any) -> Any:
+        return StoredSequence(self._items[index]) if isinstance(index, slice) else self._items[index]()
 
     def __len__(self) -> int:
-        return len(self.items)
+        return len(self._items)

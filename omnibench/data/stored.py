@@ -96,6 +96,17 @@ def values_flaw(values: Array, holds: str = "it holds", way: str = "check the un
     return row, f"{holds} {rows[row][np.abs(rows[row]).argmax()]:g}, which no robot can reach; {way}"
 
 
+def refuse(
+    file: Path, rows: Sequence[int] | Rows, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()
+) -> None:
+    """DataError for the first of some rows of a file, from 0, that is ``faulty`` (n,).
+
+    what: with ``{}`` for the row's one of the values (n,).
+    """
+    for index in np.flatnonzero(faulty)[:1].tolist():
+        raise DataError(f"{file}, row {rows[index] + 1}: {what.format(values[index]) if len(values) else what}")
+
+
 class Table:
     """A table with a column of the trajectories' names. Rows of messages count from 1, the first after the header.
 
@@ -128,9 +139,8 @@ class Table:
         return DataError(f"{self.file}, row {self.first + row + 1}: {what}")
 
     def refuse(self, faulty: NDArray[np.bool_] | pl.Series, what: str, values: Sequence[Any] | pl.Series = ()) -> None:
-        """DataError for the first row that is ``faulty`` (rows,). what: with ``{}`` for the row's one of the values."""
-        for row in np.flatnonzero(faulty)[:1].tolist():
-            raise self.fail(row, what.format(values[row]) if len(values) else what)
+        """DataError for the first row that is ``faulty`` (rows,), as ``refuse`` says it."""
+        refuse(self.file, range(self.first, self.first + len(self.frame)), faulty, what, values)
 
     def floats(self, column: str) -> pl.Series:
         """A column as floats, null where a cell is empty. DataError for text and other things."""

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from omnibench.config import Positive, validate
-from omnibench.data.aligned import WheelSamples, measured_as
 from omnibench.data.importers.bag_messages import (
     FIX,
     TRANSFORMS,
@@ -43,7 +42,7 @@ from omnibench.data.importers.bag_messages import (
 )
 from omnibench.data.recording import ReferenceOptions, ScanReadings, ScanShape, scan_difference
 from omnibench.data.references import Reference, ReferenceKind, References
-from omnibench.data.runs import find_rests
+from omnibench.data.runs import WheelSamples, find_rests, measured_as
 from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.data.splits import Names
 from omnibench.errors import ConfigError, DataError, nearest
