@@ -23,7 +23,7 @@ from omnibench.progress import Reporter, no_progress
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.simulate.source import SimulationSource, check_effect_options, read_simulation
 from omnibench.simulate.truth import Simulation, reference_noise
-from omnibench.slam.slam_request import SlamAccuracy, slam_accuracy
+from omnibench.slam.slam_dataset import SlamAccuracy, slam_accuracy
 
 
 def simulate_like(dataset: Dataset, calibration: Calibration, noise_seed: int | None = None) -> Dataset:

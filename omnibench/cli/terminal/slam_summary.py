@@ -8,7 +8,7 @@ from rich.console import Console
 
 from omnibench.cli.terminal.tables import print_table
 from omnibench.report.recording.section import bias_table, error_table, summary_table
-from omnibench.slam.slam_request import SlamAccuracy, SlamSummary
+from omnibench.slam.slam_dataset import SlamAccuracy, SlamSummary
 from omnibench.words import plural
 
 
