@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
 from numbers import Real
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,22 +18,13 @@ from pydantic_core import to_jsonable_python
 
 from omnibench.config import Model
 from omnibench.data import stored
-from omnibench.data.references import (
-    NUMBERS,
-    TURN,
-    References,
-    nearest_turns,
-    reference_flaw,
-    references_of,
-    with_whole_turns,
-)
+from omnibench.data.references import NUMBERS, TURN, References, reference_flaw, references_of, unwrap, with_whole_turns
 from omnibench.data.scans import Scans
 from omnibench.data.stored import Flaw, Table
 from omnibench.errors import DataError, UnknownNameError, nearest, require_type
 from omnibench.robot.arrays import frame_of
 from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
-from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.samples import Samples, digest_of, with_samples
 from omnibench.views import Shown
@@ -67,7 +56,6 @@ _MOST_PERIODS = 1001.0
 # Share of the runs whose headings are neither wrapped nor those of the wheels, from which on none is unwrapped (chosen:
 # in degrees most are such, in radians none); turns within which wrapped headings lie, with what rounding adds.
 _CONTRADICTED, _WITHIN = 0.25, 1.001
-_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
 _SHOWN = 5  # ids in a warning, at most
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
 _PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
@@ -302,10 +290,7 @@ def make_dataset(
     if wheels is None and (trajectories is None or poses is not None or references is not None):
         raise DataError(f"data set {name}: wheels is missing: a table with the columns t and omega_<wheel>")
     if wheels is not None and poses is None and references is None:
-        raise DataError(
-            f"data set {name}: poses is missing: a table with the columns t, x, y and theta; or references, with "
-            "distances, turns and the like"
-        )
+        raise DataError(f"data set {name}: poses is missing: a table with t, x, y and theta; or references, measured")
     if not isinstance(sample_period, Real | None):
         raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
     if wheels is None:
@@ -467,10 +452,9 @@ def checked(dataset: Dataset) -> Dataset:
         distances = np.linalg.norm(each.poses[:, :2] - each.poses[0, :2], axis=1)
         for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
             x, y = each.poses[row, :2]
-            raise DataError(
-                f"{place}: trajectory {each.id}: the pose at {each.pose_times[row]:g} s, x {x:g} and y {y:g}, is "
-                f"{distances[row]:.3g} m from the run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
-            )
+            pose = f"the pose at {each.pose_times[row]:g} s, x {x:g} and y {y:g}, is {distances[row]:.3g} m from"
+            what = f"{pose} the run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
+            raise DataError(f"{place}: trajectory {each.id}: {what}")
         moved = np.abs(each.poses - each.poses[0]).max(axis=0)
         if (far := moved > (_MOVED, _MOVED, _TURNED)).any():
             # The reference moves: do the wheels, by the design matrix, travel more than hardly any of it?
@@ -525,27 +509,6 @@ def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
     if dataset.copies:
         warnings.append(f"left out of validation, as copies of training runs: {some(dataset.copies, _SHOWN)}")
     return replace(dataset, warnings=tuple(warnings))
-
-
-def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
-
-    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
-    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
-    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
-    """
-    model = OdometryModel.of_design(robot, "arc")
-    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
-    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
-    odometries = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
-    unwrapped, ambiguous = list[Array](), list[int]()
-    for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
-        driven = odometry[:, 2]
-        continuous = nearest_turns(heading, driven)
-        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
-        if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
-            ambiguous.append(index)
-    return unwrapped, ambiguous
 
 
 def every_second(groups: Sequence[Hashable]) -> list[Split]:

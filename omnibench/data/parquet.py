@@ -50,10 +50,8 @@ def parquet_shape(file: Path) -> tuple[int, pl.Schema]:
         rows, schema = int(scanned.select(pl.len()).collect().item()), scanned.collect_schema()
         size, packed = rows * len(schema) * 8, file.stat().st_size
     if size > _LARGE and size > _PACKED * packed:
-        raise DataError(
-            f"{file}: its {packed / 1e6:.3g} MB would unpack to {size / 1e9:.3g} GB ({rows:,} rows), as no recording "
-            "does; write it anew, or leave it out"
-        )
+        large = f"its {packed / 1e6:.3g} MB would unpack to {size / 1e9:.3g} GB ({rows:,} rows), as no recording does"
+        raise DataError(f"{file}: {large}; write it anew, or leave it out")
     return rows, schema
 
 

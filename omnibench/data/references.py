@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -216,14 +218,36 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     counted = (references.kinds == "heading") & ~absolute
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
-            wanted = WheelLog(
-                log.times, log.rates, np.zeros(3), references.t1[chosen], steering=log.steering, drive=log.drive
-            )
+            wanted = replace(log, start=np.zeros(3), stamps=references.t1[chosen])
             (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
             headings, driven = values[chosen, 0], poses[:, 2]  # rad, the latter since the start
             start = (first, 0.0) if known else (headings[0], driven[0])
             values[chosen, 0] = nearest_turns(np.append(start[0], headings), np.append(start[1], driven))[1:]
     return replace(references, values=values)
+
+
+_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
+
+
+def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
+
+    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
+    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
+    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
+    """
+    model = OdometryModel.of_design(robot, "arc")
+    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
+    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
+    odometries = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
+    unwrapped, ambiguous = list[Array](), list[int]()
+    for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
+        driven = odometry[:, 2]
+        continuous = nearest_turns(heading, driven)
+        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
+        if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
+            ambiguous.append(index)
+    return unwrapped, ambiguous
 
 
 def nearest_turns(headings: Array, driven: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -121,31 +121,11 @@ class AlignedRecording:
         first = min(stamps[np.isfinite(stamps)], default=0.0)
 
         def moved(times: Array) -> Array:
-            moved: Array = times + (offset + drift * (np.where(np.isfinite(times), times, first) - first))
-            return moved
+            return times + (offset + drift * (np.where(np.isfinite(times), times, first) - first))
 
         if measured is not None:
             measured = replace(measured, t0=moved(measured.t0), t1=moved(measured.t1))
         return replace(self, poses=replace(self.poses, times=moved(self.poses.times)), measured=measured)
-
-
-def aligned_recordings(
-    recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]
-) -> Iterator[AlignedRecording]:
-    """The recordings in SI units, by one clock, which is matched if the options say so. DataError in one line.
-
-    notes: what was left out, mended or decided is added, at the end.
-    """
-    ranges = _ranges(recordings, options, notes)
-
-    def in_si(recording: Recording) -> AlignedRecording:
-        tell_reading(1, "run")
-        values, used = _readings(recording, ranges, options, notes)
-        samples = _wheel_samples(recording, values, used, options, notes)
-        return _with_reference(recording, samples, options)
-
-    aligned = map(in_si, recordings)
-    yield from aligned if options.clocks == "same" else _by_matched_clocks(list(aligned), options, notes)
 
 
 def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
@@ -232,11 +212,9 @@ def _counted_on(
             lost += int((np.round((np.diff(restored) - np.diff(on)) / register) != 0).sum())
         columns.append(restored)
     if lost:
-        back = (
-            f"{plural(lost, 'step')} of wheel positions ran back while the wheel turned on, as in a register of "
-            f"{longest:.10g} ticks that was read late; they got a turn of it back (wraps_at=2^32 or never keeps them)"
-        )
-        notes.append(FindingWarning.of_restart(f"{recording.place}: {back}"))
+        back = f"{plural(lost, 'step')} of wheel positions ran back by a register of {longest:.10g} ticks, read late"
+        mended = f"{back}; they got a turn of it back (wraps_at=2^32 or never keeps them)"
+        notes.append(FindingWarning.of_restart(f"{recording.place}: {mended}"))
     return np.column_stack(columns)
 
 
@@ -275,10 +253,8 @@ def _wheel_samples(
         raise _misread(recording, rates, lengths, options)
     restart = too_fast & (quantity == "positions")
     if gap.any() and recording.numbered:
-        notes.append(
-            f"{place}: wheel samples are missing {plural(int(gap.sum()), 'time')} while the wheels turned, up to "
-            f"{lengths[gap].max():.3g} s; runs end there"
-        )
+        missing = f"wheel samples are missing {plural(int(gap.sum()), 'time')} while the wheels turned"
+        notes.append(f"{place}: {missing}, up to {lengths[gap].max():.3g} s; runs end there")
     if count := int(restart.sum()):
         anew = f"the positions begin anew {plural(count, 'time')}, faster than any wheel turns"
         way = "if that is a counter that wraps, --set wraps_at=N"
@@ -302,10 +278,9 @@ def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptio
     unit, count = "rad" if as_they_are else options.steering_unit, len(options.robot.drive.steered)
     beyond = np.ptp(shown, axis=0) > TURNS.get(unit, np.inf)
     if (beyond & (shown == np.round(shown)).all(axis=0)).any():
-        raise DataError(
-            f"{recording.place}: the steering angles, read in {unit}, are whole numbers from {shown.min():g} to "
-            f"{shown.max():g}; --set steering_unit=ticks --set steering_ticks_per_turn=N, or another steering_unit"
-        )
+        what = f"the steering angles, read in {unit}, are whole numbers from {shown.min():g} to {shown.max():g}"
+        way = "--set steering_unit=ticks --set steering_ticks_per_turn=N, or another steering_unit"
+        raise DataError(f"{recording.place}: {what}; {way}")
     if as_they_are:
         return shown
     turns = np.broadcast_to(options.steering_ticks_per_turn or TURNS.get(unit, 1.0), count)
@@ -327,8 +302,12 @@ def _misread(recording: Recording, rates: Array, durations: Array, options: Refe
     return DataError(f"{what}; --set {first}, gear_ratio=N (turns of the motor for one of the wheel), {others}")
 
 
-def _with_reference(recording: Recording, samples: WheelSamples, options: ReferenceOptions) -> AlignedRecording:
-    """The recording with its reference in SI units and the robot's senses, by its clock with the options' offset."""
+def _aligned(
+    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
+) -> AlignedRecording:
+    """The recording in SI units and the robot's senses, its reference by its clock with the options' offset."""
+    tell_reading(1, "run")
+    samples = _wheel_samples(recording, *_readings(recording, ranges, options, notes), options, notes)
     second = SECONDS[options.pose_time_unit or (options.wheel_time_unit if recording.one_table else "s")]
     if not recording.referenced:  # poses are to be made of its scans, at their times
         times = np.empty(0) if recording.scans is None else recording.scans.times
@@ -339,10 +318,8 @@ def _with_reference(recording: Recording, samples: WheelSamples, options: Refere
         factors = options.pose_factors
         if shown.radians and options.heading_unit == "deg":
             factors = factors * np.array([1.0, 1.0, np.degrees(1.0)])
-        poses = replace(shown, times=shown.times * second)
-        if (factors != 1.0).any():
-            turned = None if shown.covariances is None else shown.covariances * np.outer(factors, factors)
-            poses = replace(poses, poses=shown.poses * factors, covariances=turned)
+        turned = None if shown.covariances is None else shown.covariances * np.outer(factors, factors)
+        poses = replace(shown, times=shown.times * second, poses=shown.poses * factors, covariances=turned)
         if options.heading_offset_deg:
             poses = replace(poses, poses=poses.poses + np.array([0.0, 0.0, np.radians(options.heading_offset_deg)]))
         if not recording.a_run and len(shown.times) > 1:
@@ -399,10 +376,8 @@ def _by_matched_clocks(
     if said:
         notes.append(f"clocks matched, added to the times of the poses: {some(said)}")
     if unknown:
-        notes.append(
-            f"clocks not matched, as the motion is too short or too even: {some(unknown)}; give "
-            "--set pose_time_offset=SECONDS, or drive with more turns"
-        )
+        way = "give --set pose_time_offset=SECONDS, or drive with more turns"
+        notes.append(f"clocks not matched, as the motion is too short or too even: {some(unknown)}; {way}")
     return matched
 
 
@@ -439,9 +414,13 @@ def dataset_of(
     """
     scratch = Scratch() if isinstance(recordings, StoredSequence) else None
     runs, cuts, referenced = list[MadeRun](), list[str](), True
-    for aligned in aligned_recordings(recordings, options, notes):
-        referenced &= aligned.recording.referenced
-        made = cut_into_runs(aligned, options, cuts, alone=len(recordings) == 1)
+    ranges = _ranges(recordings, options, notes)
+    aligned: Iterable[AlignedRecording] = (_aligned(each, ranges, options, notes) for each in recordings)
+    if options.clocks == "match":
+        aligned = _by_matched_clocks(list(aligned), options, notes)
+    for each in aligned:
+        referenced &= each.recording.referenced
+        made = cut_into_runs(each, options, cuts, alone=len(recordings) == 1)
         runs += made if scratch is None else [_in_file(run, scratch) for run in made]
     notes += cuts
     if not runs:
@@ -480,14 +459,18 @@ def cut_into_runs(
 
     alone: the recording is the only one. DataError: its wheels and poses share no time.
     """
-    recording, samples = aligned.recording, aligned.samples
+    recording, samples, place = aligned.recording, aligned.samples, aligned.recording.place
     if (sensors := recording.sensors) is not None:
-        sensors = sensors.without_bias(samples, options.least_rest, options.still, recording.place)
+        sensors = sensors.without_bias(samples, options.least_rest, options.still, place)
         aligned = replace(aligned, recording=replace(recording, sensors=sensors))
     unmoved = recording.poses is not None and np.array_equal(aligned.poses.times, recording.poses.times)
     cut = options.longest_gap or options.jumps != "keep" or options.start_at_rest or options.cutting != "none"
-    if recording.a_run and unmoved and not cut:
-        return [_as_it_is(aligned)]
+    if recording.a_run and unmoved and not cut:  # as it was read
+        made = _made(aligned, np.arange(len(samples.ends)), 0.0, aligned.poses)
+        measured = None if aligned.measured is None else aligned.measured.of_run(0.0, float(samples.ends[-1]))
+        stated: dict[str, Any] = {name: recording.attributes.numbers.get(name) for name in ("duration", "distance")}
+        scans = np.arange(0 if recording.scans is None else len(recording.scans.times))
+        return [replace(made, trajectory=replace(made.trajectory, references=measured, **stated), scans=scans)]
     uncut = [piece for part in samples.stretches() for piece in _pieces(aligned, part, options)]
     aligned, breaks = _without_lone_jumps(aligned, options, notes)
     pieces = [piece for each in uncut for piece in _unbroken(each, aligned, breaks, options)]
@@ -503,36 +486,24 @@ def cut_into_runs(
         else:
             runs.append(_called(run, samples, piece, number if several else None, len(runs) + 1, alone=alone))
     if len(pieces) > len(uncut) and runs:
-        notes.append(
-            f"{recording.place}: cut into {plural(len(pieces), 'run')} where wheels or poses are missing or jump"
-        )
+        notes.append(f"{place}: cut into {plural(len(pieces), 'run')} where wheels or poses are missing or jump")
     if left_out:
         said = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
-        notes.append(f"{recording.place}: {left_out.total()} of {plural(len(pieces), 'run')} left out: {said}")
+        notes.append(f"{place}: {left_out.total()} of {plural(len(pieces), 'run')} left out: {said}")
     if not pieces:
         what = "nothing of cut_topic was recorded while the wheels were"
         if options.cutting == "rests":
             what = f"the wheels rest all the time (less than {options.rest_rate:g} rad/s, rest_rate)"
-        notes.append(f"{recording.place}: {what}")
+        notes.append(f"{place}: {what}")
     if not runs and {*left_out} == {bare} and not recording.numbered:
         raise _apart(aligned, options.pose_time_offset)
     if alone and options.cutting == "rests" and runs and len(uncut) == len(list(samples.stretches())):
         advice = f"no rest of {options.least_rest:g} s cuts it; --set cut=topic or cut=windows for more runs"
-        notes.append(f"{recording.place}: {advice}")
+        notes.append(f"{place}: {advice}")
     referenced = _with_references(runs, aligned, notes, whole=not several)
     if runs and not referenced and alone and sensors is None:
         raise _apart(aligned, options.pose_time_offset)
     return referenced
-
-
-def _as_it_is(aligned: AlignedRecording) -> MadeRun:
-    """The run of a recording that is one, with its wheels and references as they were read."""
-    recording, samples, measured = aligned.recording, aligned.samples, aligned.measured
-    made = _made(aligned, np.arange(len(samples.ends)), 0.0, aligned.poses)
-    measured = None if measured is None else measured.of_run(0.0, float(samples.ends[-1]))
-    duration, distance = (recording.attributes.numbers.get(name) for name in ("duration", "distance"))
-    run = replace(made.trajectory, references=measured, duration=duration, distance=distance)
-    return replace(made, trajectory=run, scans=np.arange(0 if recording.scans is None else len(recording.scans.times)))
 
 
 def _pieces(aligned: AlignedRecording, part: slice, options: ReferenceOptions) -> list[Piece]:
@@ -690,8 +661,7 @@ def _run(aligned: AlignedRecording, piece: Piece, span: Span, *, whole: bool) ->
     if not whole:
         # From pose to pose where it was cut: one interpolated within a drive would be wrong by the path's bend.
         poses = poses.only((poses.times >= begin - _SAME_TIME) & (poses.times <= end + _SAME_TIME))
-    placed = align(first, float(samples.ends[rows[-1]]), poses) if len(poses.times) > 1 else None
-    if placed is None:
+    if len(poses.times) < 2 or (placed := align(first, float(samples.ends[rows[-1]]), poses)) is None:
         return None
     zero, seen = placed
     return _made(aligned, rows[samples.ends[rows] > zero + _SAME_TIME], zero, seen)
@@ -807,10 +777,9 @@ def _with_references(
     if sensors is not None and len(referenced) < len(runs):
         notes.append(f"{place}: {plural(len(runs) - len(referenced), 'run')} without references left out")
     if measured is not None and count < len(measured):
-        notes.append(
-            f"{place}: {len(measured) - count} of {plural(len(measured), 'reference')} left out, outside of the "
-            "wheels' samples or across a cut; if the clocks differ, set pose_time_unit or pose_time_offset"
-        )
+        lost = f"{len(measured) - count} of {plural(len(measured), 'reference')} left out, outside of the wheels'"
+        way = "if the clocks differ, set pose_time_unit or pose_time_offset"
+        notes.append(f"{place}: {lost} samples or across a cut; {way}")
     return referenced
 
 
@@ -818,10 +787,8 @@ def _apart(aligned: AlignedRecording, offset: float) -> DataError:
     """The error of wheels and poses that share no time. offset: that was added to the poses' times, s."""
     samples, times, place = aligned.samples, aligned.poses.times, aligned.recording.place
     if len(times) < 2 and aligned.measured is not None:
-        return DataError(
-            f"{place}: none of its references lies within its wheels' samples, {samples.begins[0]:.10g} to "
-            f"{samples.ends[-1]:.10g} s; times count by the wheels' clock (--set pose_time_unit=ms, pose_time_offset=S)"
-        )
+        within = f"none of its references lies within its wheels' {samples.begins[0]:.10g} to {samples.ends[-1]:.10g} s"
+        return DataError(f"{place}: {within}; by the wheels' clock: --set pose_time_unit=ms, pose_time_offset=S")
     for what, count in (("poses", len(times)), ("wheels", len(samples.ends))):
         if count < 2:
             return DataError(f"{place}: {what}: has one row; two are needed, or the run is no run")
@@ -899,9 +866,7 @@ def divided_runs(
     parted = divided(runs, options.train, options.validation, otherwise=splits)
     train, validation = ({motions[run.id] for run in parted if run.split == side} for side in SPLITS)
     if train and (missing := sorted(validation - train)):
-        notes.append(
-            f"validation holds runs that go {' and '.join(missing)}, as no training run does; divide them anew"
-        )
+        notes.append(f"validation holds runs that go {' and '.join(missing)}; divide anew, as no training run does so")
     for index, run in enumerate(parted):
         recording = source[run.id].recording
         if recording.a_run or recording.attributes.repetition is not None:
@@ -920,17 +885,14 @@ def division_in_words(robot: Robot, runs: Sequence[Trajectory], options: Mapping
         driven = {run.command for run in members if run.command is not None}
         of_commands = f" of {plural(len(driven), 'command')}" if driven else ""
         parts.append(f"{name} {plural(len(members), 'run')}{of_commands}")
-    given = {side: options[side] for side in SPLITS if options.get(side)}
-    if given:
-        rule = f"by {', '.join(f'{side}={value}' for side, value in given.items())}"
+    alike = [c if c and commands.count(c) > 1 else motion_of(robot, run) for c, run in zip(commands, runs, strict=True)]
+    rule = "as the source or its importer says"
+    if given := [f"{side}={options[side]}" for side in SPLITS if options.get(side)]:
+        rule = f"by {', '.join(given)}"
     elif splits == every_second(commands):
         rule = "every second run of a command validates"
-    elif splits == every_second(
-        [c if c and commands.count(c) > 1 else motion_of(robot, run) for c, run in zip(commands, runs, strict=True)]
-    ):
+    elif splits == every_second(alike):
         rule = "every second run of a command, or of those that move alike by their wheels, validates"
-    else:
-        rule = "as the source or its importer says"
     return f"{', '.join(parts)}, {rule}"
 
 

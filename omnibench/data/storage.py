@@ -97,10 +97,8 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> Dataset:
     scans = None
     if (file := table_file(folder, "scans")) is not None:
         if header.scanner is None:
-            raise DataError(
-                f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
-                "angle_increment, range_max (rad, m)"
-            )
+            keys = "rays, angle_min, angle_increment, range_max (rad, m)"
+            raise DataError(f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: {keys}")
         scans = ScansOnDisk(file, header.scanner, runs.ids)
     described = {name: getattr(header, name) for name in _DESCRIBED}
     return Dataset(trajectories=tuple(trajectories), scans=scans, **described)
@@ -191,10 +189,7 @@ def save_dataset(
     require_type(dataset, Dataset, "load_dataset")
     folder, runs = Path(path), dataset.trajectories
     if not dataset.referenced:
-        raise DataError(
-            f"data set {dataset.name}: it has no reference poses; make them from its scans with slam_dataset, as "
-            "omnibench.import_dataset does"
-        )
+        raise DataError(f"data set {dataset.name}: it has no reference poses; make them from its scans (slam_dataset)")
     for run in runs:
         if run.references is None and (flaw := stored.pose_times_flaw(run.pose_times, run.id, fewest=2)) is not None:
             raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")

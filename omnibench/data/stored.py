@@ -294,10 +294,8 @@ def _present_columns(file: Path, columns: Sequence[str], robot: Robot) -> dict[s
     for wheel in robot.drive.steered:
         if (column := f"steer_{wheel}") not in columns:
             hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
-            raise DataError(
-                f"{file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
-                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
-            )
+            what = f"the steering angle of wheel {wheel} (rad, counter-clockwise, at the sample's end), is missing"
+            raise DataError(f"{file}: column {column!r}, {what}; {hint}found: {', '.join(columns)}")
     return present_groups(file, wheel_columns(robot), columns)
 
 
