@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, sink_frames
+from omnibench.data.parquet import OpenedTable, parquet_shape, readable, sink_frames
 from omnibench.data.stored import Rows, Table, check_columns, refuse, times_flaw
 from omnibench.errors import DataError
 from omnibench.files import TableFormat, check_file, unquoted_formulas
@@ -184,16 +184,15 @@ class ScansOnDisk(Scans):
     """
 
     def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
-        self.file, self._state, self._in_parquet = file, file_state(file), file.suffix == ".parquet"
-        self._place = f"{file}: "
-        if self._in_parquet:
+        self.file, self._place, self._table = file, f"{file}: ", OpenedTable.of(file)
+        if in_parquet := file.suffix == ".parquet":
             parquet_shape(file)
         else:
             check_file(file, text=True)
         with readable(file):
-            check_columns(file, list(self._lazy().collect_schema()), _COLUMNS)
-            frame = self._lazy().select("trajectory", "t").collect()
-        table = Table(file, frame if self._in_parquet else unquoted_formulas(frame))
+            check_columns(file, list(self._table.lazy().collect_schema()), _COLUMNS)
+        frame = self._table.rows(["trajectory", "t"])
+        table = Table(file, frame if in_parquet else unquoted_formulas(frame))
         times, ids = table.numbers("t"), list(trajectories)
         recorded: dict[str, tuple[Array, Callable[[], Ranges]]] = {}
         for index, rows in table.rows_by_run(ids, "the table of trajectories"):
@@ -203,19 +202,29 @@ class ScansOnDisk(Scans):
             recorded[ids[index]] = of_run, partial(self._ranges, rows, ids[index], of_run)
         super().__init__(scanner, recorded)
 
-    def _lazy(self) -> pl.LazyFrame:
-        if self._in_parquet:
-            return pl.scan_parquet(self.file, glob=False)
-        # Cells are read as text, so that one that is no number is reported with its row.
-        return pl.scan_csv(self.file, infer_schema=False, glob=False)
-
     def _ranges(self, rows: Rows, trajectory: str, times: Array) -> Ranges:
         """The ranges (S, R) of a trajectory's rows, which are read in parts. DataError names the row of a flaw."""
-        check_unchanged(self.file, self._state)
-        ranges = np.empty((len(rows), self.scanner.rays), np.float32)
-        parts = np.flatnonzero(np.diff(rows // (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV))) + 1
-        for part in np.split(np.arange(len(rows)), parts):
-            ranges[part] = self._read(rows[part])
+        rays = self.scanner.rays
+        ranges = np.empty((len(rows), rays), np.float32)
+        most = _MOST_ROWS if self.file.suffix == ".parquet" else _ROWS_OF_CSV
+        edges = np.flatnonzero(np.diff(rows // most)) + 1
+        for part in np.split(np.arange(len(rows)), edges):
+            wrong, first, last = partial(refuse, self.file, rows[part]), int(rows[part[0]]), int(rows[part[-1]])
+            column = self._table.rows(["ranges"], first, last - first + 1)["ranges"][rows[part] - first]
+            if isinstance(column.dtype, pl.Array):
+                column = column.arr.to_list()
+            if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
+                texts = column.str.strip_chars().str.split(" ")
+                column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
+                broken = texts.list.len() != column.list.drop_nulls().list.len()
+                wrong(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
+            if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
+                raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
+            lengths = column.list.len().fill_null(0)
+            wrong(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
+            ranges[part] = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(-1, rays)
+            unknown = np.isnan(ranges[part]).any(axis=1)
+            wrong(unknown, "a range is missing or NaN; write inf where nothing was seen")
         empty = ~self.scanner.valid(ranges).any(axis=1)
         for row in np.flatnonzero(empty)[:1].tolist():
             seen = ranges[row][np.isfinite(ranges[row])]
@@ -224,27 +233,6 @@ class ScansOnDisk(Scans):
             way = "they look like mm, give m" if in_millimetres else "remove the row"
             what = f"the scan of trajectory {trajectory} at {times[row]:g} s is empty: no range {limits}; {way}"
             refuse(self.file, rows, empty, what)
-        return ranges
-
-    def _read(self, rows: Rows) -> Ranges:
-        """The ranges (n, R) of some rows; DataError: they are not as many numbers as the scanner has rays."""
-        wrong = partial(refuse, self.file, rows)
-        first, last, rays = int(rows[0]), int(rows[-1]), self.scanner.rays
-        with readable(self.file):
-            column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"][rows - first]
-        if isinstance(column.dtype, pl.Array):
-            column = column.arr.to_list()
-        if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
-            texts = column.str.strip_chars().str.split(" ")
-            column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
-            broken = texts.list.len() != column.list.drop_nulls().list.len()
-            wrong(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
-        if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
-            raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
-        lengths = column.list.len().fill_null(0).to_numpy()
-        wrong(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths.tolist())
-        ranges: Ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
-        wrong(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
         return ranges
 
 
@@ -256,7 +244,7 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
     as_text = table_format == "csv"
 
     def frames() -> Iterator[pl.DataFrame]:
-        for trajectory in (name for name in trajectories if name in scans.trajectories):
+        for trajectory in filter(set(scans.trajectories).__contains__, trajectories):
             of_run = scans.of(trajectory)
             for first in range(0, len(of_run.times), _ROW_GROUP):
                 part = slice(first, first + _ROW_GROUP)

@@ -189,7 +189,7 @@ def save_dataset(
     require_type(dataset, Dataset, "load_dataset")
     folder, runs = Path(path), dataset.trajectories
     if not dataset.referenced:
-        raise DataError(f"data set {dataset.name}: it has no reference poses; make them from its scans (slam_dataset)")
+        raise DataError(f"data set {dataset.name}: it has no reference poses; omnibench.import_dataset makes some")
     for run in runs:
         if run.references is None and (flaw := stored.pose_times_flaw(run.pose_times, run.id, fewest=2)) is not None:
             raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")

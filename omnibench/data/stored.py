@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
 from omnibench.data.delimited import missing_column, not_increasing
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, scan_table
+from omnibench.data.parquet import OpenedTable, parquet_shape, readable, scan_table
 from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
 from omnibench.progress import tell_reading
@@ -319,12 +319,13 @@ def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | N
     None: the rows of a run do not stand together, or numbers are texts, so that the table must be read whole. DataError
     as for ``samples_in_memory``.
     """
-    state, (length, types) = file_state(file), parquet_shape(file)
+    # Workers, and jobs that change their folder, find an absolute path, too.
+    table, (length, types) = OpenedTable.of(file.absolute()), parquet_shape(file)
     columns = _present_columns(file, list(types), robot)
     names = ["trajectory", "t", *(name for group in columns.values() for name in group)]
     if not all(types[name].is_numeric() for name in names[1:]):
         return None
-    pieces = (Table(file, _rows(file, names, at, _ROWS), names, at) for at in range(0, max(length, 1), _ROWS))
+    pieces = (Table(file, _rows(table, names, at, _ROWS), names, at) for at in range(0, max(length, 1), _ROWS))
     places: dict[int, tuple[int, int, float]] = {}  # first row, number of rows and end of each run
     for index, rows, arrays in arrays_by_run(pieces, runs, columns, wheel_times_flaw):
         first, count, _ = places.get(index, (int(rows[0]), 0, 0.0))
@@ -334,8 +335,6 @@ def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | N
     refuse_runs_without_rows(file, runs, places)
     columns = {"times": ["t"], **columns}
     of_odometry = [column for name in _OF_ODOMETRY for column in columns.get(name, ())]
-    # Workers, and jobs that change their folder, find an absolute path, too.
-    read = partial(_read, file.absolute(), state)
     samples = []
     for index in range(len(places)):
         first, count, end = places[index]
@@ -343,36 +342,29 @@ def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | N
         for name, group in columns.items():
             together = of_odometry if name in _OF_ODOMETRY else group
             chosen = slice(begin := together.index(group[0]), begin + len(group))
-            readers[name] = partial(read, tuple(together), chosen, first, count, name == "times")
+            readers[name] = partial(_read, table, tuple(together), chosen, first, count, name == "times")
         samples.append(Samples(readers, (count, end)))
     return samples
 
 
-def _rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
-    with readable(file):
-        frame = pl.scan_parquet(file, glob=False).select(columns).slice(first, count).collect()
-    tell_reading(len(frame), "sample")
-    return frame
+def _rows(table: OpenedTable, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
+    rows = table.rows(columns, first, count)
+    tell_reading(len(rows), "sample")
+    return rows
 
 
 @lru_cache(maxsize=_BLOCKS_HELD)
-def read_block(file: Path, state: tuple[int, int], columns: tuple[str, ...], number: int) -> Array:
-    """Values (rows, n) of some columns of a Parquet file's block, by its number from 0 on.
-
-    state: of the file when it was opened, see ``file_state``. DataError: it has changed, or cannot be read.
-    """
-    check_unchanged(file, state)
-    return _rows(file, columns, number * _BLOCK_ROWS, _BLOCK_ROWS).cast(pl.Float64).to_numpy()
+def read_block(table: OpenedTable, columns: tuple[str, ...], number: int) -> Array:
+    """Values (rows, n) of some columns of a block of a Parquet file, by its number from 0 on. DataError."""
+    return _rows(table, columns, number * _BLOCK_ROWS, _BLOCK_ROWS).cast(pl.Float64).to_numpy()
 
 
-def _read(
-    file: Path, state: tuple[int, int], columns: tuple[str, ...], chosen: slice, first: int, count: int, flat: bool
-) -> Array:
+def _read(table: OpenedTable, columns: tuple[str, ...], chosen: slice, first: int, count: int, flat: bool) -> Array:
     """Values (count, n) of the chosen ones of some columns, from a row on; (count,) where ``flat``."""
     parts = []
     for number in range(first // _BLOCK_ROWS, (first + count - 1) // _BLOCK_ROWS + 1):
         begin = first - number * _BLOCK_ROWS
-        parts.append(read_block(file, state, columns, number)[max(begin, 0) : begin + count, chosen])
+        parts.append(read_block(table, columns, number)[max(begin, 0) : begin + count, chosen])
     # A copy, as a view would keep the whole block.
     values = np.concatenate(parts, out=np.empty((count, chosen.stop - chosen.start)))
     values.flags.writeable = False  # a change would be lost

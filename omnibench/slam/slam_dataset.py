@@ -625,7 +625,7 @@ def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
     return RunErrors(times, np.interp(times, truth.times, way), in_robot, nees)
 
 
-def _summary(runs: list[RunErrors]) -> ErrorSummary:
+def _summary(runs: Sequence[RunErrors]) -> ErrorSummary:
     errors = np.concatenate([run.in_robot for run in runs])
     nees = np.concatenate([np.zeros(0), *(run.nees for run in runs if run.nees is not None)])
     nees = nees[np.isfinite(nees)]
@@ -713,21 +713,17 @@ def distances(one: Dataset, other: Dataset) -> Distances | None:
 
     Compared at the stamps of the data set with fewer poses; the other's poses are interpolated by straight lines.
     """
-    pairs = zip(one.trajectories, other.trajectories, strict=True)
-    errors = np.concatenate([_apart(mine, theirs) for mine, theirs in pairs])
-    if not len(errors):
+    parts = []
+    for runs in zip(one.trajectories, other.trajectories, strict=True):
+        sparse, dense = sorted(runs, key=lambda run: len(run.pose_times))
+        times, within = sparse.pose_times, dense.pose_times[[0, -1]] + [-_SAME_TIME, _SAME_TIME]
+        common = (times > _SAME_TIME) & (times >= within[0]) & (times <= within[1])
+        turns = np.round((sparse.poses[0, 2] - dense.poses[0, 2]) / (2 * np.pi))  # only these are taken away
+        there = interpolated(times[common], dense.pose_times, dense.poses)
+        parts.append(sparse.poses[common] - there - [0.0, 0.0, 2 * np.pi * turns])
+    if not len(errors := np.concatenate(parts)):
         return None
     return Distances(**{name: value for name, value in _spread(errors).items() if name in Distances.model_fields})
-
-
-def _apart(one: Trajectory, other: Trajectory) -> Array:
-    """Differences (K, 3) at the common times after the start; only whole turns at the start are taken away."""
-    sparse, dense = sorted((one, other), key=lambda run: len(run.pose_times))
-    times, within = sparse.pose_times, dense.pose_times[[0, -1]] + [-_SAME_TIME, _SAME_TIME]
-    common = (times > _SAME_TIME) & (times >= within[0]) & (times <= within[1])
-    turns = np.round((sparse.poses[0, 2] - dense.poses[0, 2]) / (2 * np.pi))
-    there = interpolated(times[common], dense.pose_times, dense.poses)
-    return sparse.poses[common] - there - [0.0, 0.0, 2 * np.pi * turns]
 
 
 _WORKERS = 2  # processes at a time: results do not depend on their number
