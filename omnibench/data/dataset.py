@@ -309,7 +309,7 @@ def make_dataset(
             listed = listed.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
         of_runs = check_runs(Table(Path("trajectories"), listed, required["trajectories"]))
         samples = stored.samples_in_memory(tables["wheels"], of_runs, robot)
-        runs = runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
+        runs = runs_of_tables(of_runs, samples, tables)
     if sample_period is None:  # the median; that there is no run is said next
         sample_period = round(stored.median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
     made = Dataset(name, robot, sample_period, tuple(runs), description, source, licence, simulated, scans=scans)
@@ -378,21 +378,16 @@ def check_runs(runs: Table) -> Table:
     return runs
 
 
-def runs_of_tables(
-    runs: Table,
-    samples: Sequence[Samples],
-    poses: Table | None,
-    references: Table | None,
-    commands: Table | None = None,
-) -> list[Trajectory]:
-    """The runs of a data set's tables. DataError names the table, the row and what is wrong.
+def runs_of_tables(runs: Table, samples: Sequence[Samples], tables: Mapping[str, Table]) -> list[Trajectory]:
+    """The runs of a data set's tables by name. DataError names the table, the row and what is wrong.
 
-    runs: see ``check_runs``. samples: of each run. poses: None where all runs have references. references: a row for
+    runs: see ``check_runs``. samples: of each run. poses: none where all runs have references. references: a row for
     each measurement of a run's motion, with columns trajectory, kind, value and sigma of kinds of one number, value_x,
     value_y, sigma_x and sigma_y of those of two (sigma stands for both where these are empty), t0 and t1, which may be
     missing or empty: the run's start and end; sigma_rate (rad/s) of a gyro's offset, which the turns of a session
     share. commands: the motion commands that were sent in runs, if they were recorded.
     """
+    poses, references, commands = (tables.get(name) for name in ("poses", "references", "commands"))
     started = set() if poses is None else set(poses.ids)
     measured: dict[str, References] = {}
     if references is not None:

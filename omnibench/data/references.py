@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -25,9 +24,7 @@ KINDS: tuple[ReferenceKind, ...] = get_args(ReferenceKind)
 PLANAR: frozenset[str] = frozenset({"displacement", "position"})  # kinds of two numbers, x and y
 TURN = 2 * np.pi  # rad
 AT_ONE_TIME: frozenset[str] = frozenset({"position", "heading"})  # kinds of an instant, t1, where t0 is not given
-UNITS: Mapping[str, Literal["m", "rad"]] = MappingProxyType(
-    {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
-)
+UNITS: Mapping[str, Literal["m", "rad"]] = {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,7 @@ from omnibench.robot.odometry import WheelLog
 from omnibench.robot.samples import Samples
 from omnibench.words import plural, some
 
-_NUMBER = re.compile(
-    r"(?:run|trial|exp|experiment|test|take|rep|repetition|drive|log|bag|recording|traj|trajectory)?\d*"
-)
+_NUMBER = re.compile(r"(?:run|trial|exp(eriment)?|test|take|rep(etition)?|drive|log|bag|recording|traj(ectory)?)?\d*")
 _KEPT = 0.5  # s of rest that are kept before and after a run (chosen)
 # A robot rests while no wheel leaves a range of this angle (chosen, as that of the importer of bags) for this time
 # (chosen; shorter than there, as no run is cut in two by it).
@@ -94,9 +92,8 @@ class WheelSamples:
         """The log of a part, from t = 0 at its begin, with poses wanted at ``stamps`` (K,), s of the recording."""
         zero, drive = float(self.begins[part][0]), None if robot.drive.direct else robot.drive
         steering = None if self.steering is None else self.steering[part]
-        return WheelLog(
-            self.ends[part] - zero, self.rates[part], np.zeros(3), stamps - zero, steering=steering, drive=drive
-        )
+        ends, stamps = self.ends[part] - zero, stamps - zero
+        return WheelLog(ends, self.rates[part], np.zeros(3), stamps, steering=steering, drive=drive)
 
 
 @dataclass(frozen=True, eq=False)
@@ -559,18 +556,13 @@ def between_rests(part: slice, span: Span, rests: Sequence[Span], stamps: Array)
 
     stamps (K,): stamps of the reference poses, s. Drives on either side of a rest share at most an instant of it.
     """
-    begin, end = span
-    edges = [*rests]
-    if not rests or rests[0][0] > begin:
-        edges = [(begin, begin), *edges]
-    if not rests or rests[-1][1] < end:
-        edges = [*edges, (end, end)]
-    pieces = []
-    for before, after in pairwise(edges):
-        first = departure(before, before[0] > begin, stamps)
-        # The end at a reference pose of the rest, if it has one: a departure with the time reversed.
-        last = -departure((-after[1], -after[0]), after[1] < end, -stamps[::-1])
-        pieces.append(Piece(part, (first, last), after[0] - before[1]))
+    (begin, end), pieces = span, []
+    for before, after in pairwise([(begin, begin), *rests, (end, end)]):
+        if after[0] > before[1]:  # no rest stands at the begin or the end
+            first = departure(before, before[0] > begin, stamps)
+            # The end at a reference pose of the rest, if it has one: a departure with the time reversed.
+            last = -departure((-after[1], -after[0]), after[1] < end, -stamps[::-1])
+            pieces.append(Piece(part, (first, last), after[0] - before[1]))
     return pieces
 
 

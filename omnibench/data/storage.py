@@ -93,7 +93,7 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> Dataset:
         if table_file(folder, name) is not None or (name == "poses" and not tables):
             tables[name] = read_table(folder, name)
     samples = stored.read_samples(folder, runs, header.robot, left_in_files=left_in_files)
-    trajectories = runs_of_tables(runs, samples, *(tables.get(name) for name in ("poses", "references", "commands")))
+    trajectories = runs_of_tables(runs, samples, tables)
     scans = None
     if (file := table_file(folder, "scans")) is not None:
         if header.scanner is None:

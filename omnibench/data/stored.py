@@ -29,6 +29,7 @@ from omnibench.robot.samples import Samples
 
 Rows = NDArray[np.intp]  # indices of rows of a table
 Flaw = tuple[int, str]  # row (0 is the first) of an array, and what is wrong there
+TimesFlaw = Callable[[Array, str], Flaw | None]  # the flaw in the times (n,) of a run, and its id
 
 LARGEST = 1e9  # a larger number is no measurement in SI units
 
@@ -203,7 +204,7 @@ def present_groups(file: Path, groups: Mapping[str, list[str]], columns: Collect
 
 
 def arrays_by_run(
-    pieces: Iterable[Table], runs: Table, groups: Mapping[str, list[str]], flaw: Callable[[Array, str], Flaw | None]
+    pieces: Iterable[Table], runs: Table, groups: Mapping[str, list[str]], flaw: TimesFlaw
 ) -> Iterator[tuple[int, Rows, dict[str, Array]]]:
     """Arrays of the runs in the pieces of a table one after another: index of the run, its rows, its arrays by name.
 
@@ -222,11 +223,7 @@ def arrays_by_run(
 
 
 def arrays_of_runs(
-    table: Table | None,
-    runs: Table,
-    groups: Mapping[str, list[str]],
-    flaw: Callable[[Array, str], Flaw | None],
-    without: Collection[str] = (),
+    table: Table | None, runs: Table, groups: Mapping[str, list[str]], flaw: TimesFlaw, without: Collection[str] = ()
 ) -> list[dict[str, Array]]:
     """The arrays of each run in a table, if there is one. without: ids of runs that may have no rows in it."""
     arrays = {index: of_run for index, _, of_run in arrays_by_run([table] if table else [], runs, groups, flaw)}
