@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -164,45 +164,39 @@ def reference_flaw(references: References, end: float | None) -> Flaw | None:
 
     end: of its wheel samples, s; None: whatever the times of the references are.
     """
+    return next(_flaws(references, end), None)
+
+
+def _flaws(references: References, end: float | None) -> Iterator[Flaw]:
     columns = (references.kinds, references.t0, references.t1, references.values, references.sigmas)
     for row, (kind, t0, t1, values, sigmas) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        if what := _flaw_of_row(kind, t0, t1, values, sigmas, end):
-            return row, what
-    if 0 <= references.rate_sigma <= LARGEST:
-        return None
-    return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
-
-
-def _flaw_of_row(
-    kind: str, t0: float, t1: float, values: Sequence[float], sigmas: Sequence[float], end: float | None
-) -> str:
-    """What is wrong with a reference, its values and standard deviations (2,); empty if nothing is."""
-    if kind not in KINDS:
-        return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
-    if end is not None:
-        for name, value in (("t0", t0), ("t1", t1)):
-            if not 0 <= value < np.inf:
-                return f"{name} is {value:g}; s since the run's start, finite and not negative"
-        if t1 > end + LATE:
-            return f"t1 is {t1:g}, after the last wheel sample at {end:g} s; check the clocks, or leave the row out"
-        if kind == "position" and t0 != t1:
-            return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
-        if kind == "heading" and t0 not in (0.0, t1):
-            return f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn for one since t0"
-        if kind not in AT_ONE_TIME and t0 >= t1:
-            return f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
-    axes = ("_x", "_y") if kind in PLANAR else ("",)
-    for axis, value, sigma in zip(axes, values, sigmas, strict=False):
-        if np.isnan(value):
-            return f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
-        if not abs(value) <= LARGEST:
-            return f"value{axis} is {value:g}, which no robot can reach; check the units"
-        if not 0 < sigma <= LARGEST:
-            stated = "missing" if np.isnan(sigma) else f"{sigma:g}"
-            return f"sigma{axis} is {stated}; a standard deviation is > 0 (how exactly the {kind} is known)"
-    if kind == "distance" and values[0] < 0:
-        return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
-    return ""
+        if kind not in KINDS:
+            yield row, f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
+        if end is not None:
+            for name, value in (("t0", t0), ("t1", t1)):
+                if not 0 <= value < np.inf:
+                    yield row, f"{name} is {value:g}; s since the run's start, finite and not negative"
+            if t1 > end + LATE:
+                yield row, f"t1 is {t1:g}, after the wheels' end at {end:g} s; check the clocks, or leave the row out"
+            if kind == "position" and t0 != t1:
+                yield row, f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
+            if kind == "heading" and t0 not in (0.0, t1):
+                yield row, f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn"
+            if kind not in AT_ONE_TIME and t0 >= t1:
+                yield row, f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
+        axes = ("_x", "_y") if kind in PLANAR else ("",)
+        for axis, value, sigma in zip(axes, values, sigmas, strict=False):
+            if np.isnan(value):
+                yield row, f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
+            if not abs(value) <= LARGEST:
+                yield row, f"value{axis} is {value:g}, which no robot can reach; check the units"
+            if not 0 < sigma <= LARGEST:
+                stated = "missing" if np.isnan(sigma) else f"{sigma:g}"
+                yield row, f"sigma{axis} is {stated}; a standard deviation is > 0 (how exactly the {kind} is known)"
+        if kind == "distance" and values[0] < 0:
+            yield row, f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
+    if not 0 <= references.rate_sigma <= LARGEST:
+        yield 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
 
 
 def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> References:
@@ -215,11 +209,10 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     counted = (references.kinds == "heading") & ~absolute
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
-            wanted = replace(log, start=np.zeros(3), stamps=references.t1[chosen])
-            (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
-            headings, driven = values[chosen, 0], poses[:, 2]  # rad, the latter since the start
-            start = (first, 0.0) if known else (headings[0], driven[0])
-            values[chosen, 0] = nearest_turns(np.append(start[0], headings), np.append(start[1], driven))[1:]
+            begin = [0.0] * known  # the run's start, where it is known
+            wanted = replace(log, start=np.zeros(3), stamps=np.append(begin, references.t1[chosen]))
+            (headings,), _ = unwrap(robot, [wanted], [np.append([first] * known, values[chosen, 0])])
+            values[chosen, 0] = headings[len(begin) :]
     return replace(references, values=values)
 
 

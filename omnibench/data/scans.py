@@ -94,11 +94,10 @@ class Scanner(Model):
     @property
     def bearings(self) -> Array:
         """Directions of the rays (R,) over the floor, in the robot's frame, rad."""
-        pitch = self.mount.pitch
-        if not pitch:
-            return self.angles + self.mount.yaw
-        over_the_floor: Array = np.arctan2(np.sin(self.angles), np.cos(self.angles) * math.cos(pitch))  # Eq. (1)
-        return over_the_floor + self.mount.yaw
+        angles, pitch = self.angles, self.mount.pitch
+        if pitch:
+            angles = np.arctan2(np.sin(angles), np.cos(angles) * math.cos(pitch))  # Eq. (1)
+        return angles + self.mount.yaw
 
     @property
     def level_shares(self) -> Array:
@@ -111,8 +110,7 @@ class Scanner(Model):
         """Ranges (R,) at which the rays meet the floor, m; inf for those that do not."""
         down = np.cos(self.angles) * math.sin(self.mount.pitch)  # Eq. (1)
         falling = down > 0
-        ranges: Array = np.where(falling, self.mount.height / np.where(falling, down, 1.0), np.inf)
-        return ranges
+        return np.where(falling, self.mount.height / np.where(falling, down, 1.0), np.inf)
 
     @property
     def delays(self) -> Array:
