@@ -35,7 +35,7 @@ from omnibench.data.recording import (
 )
 from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
-from omnibench.data.scratch import Scratch, StoredSequence
+from omnibench.data.scratch import Scratch
 from omnibench.data.splits import complete, divided, every_second, remaining
 from omnibench.errors import DataError
 from omnibench.progress import tell_reading
@@ -409,7 +409,7 @@ def dataset_of(
 
     notes: what was left out, mended or decided is added; the data set's warnings hold it.
     """
-    scratch = Scratch() if isinstance(recordings, StoredSequence) else None
+    scratch = Scratch() if isinstance(recordings, Scratch) else None
     runs, cuts, referenced = list[MadeRun](), list[str](), True
     ranges = _ranges(recordings, options, notes)
     aligned: Iterable[AlignedRecording] = (_aligned(each, ranges, options, notes) for each in recordings)
@@ -749,9 +749,8 @@ def _with_references(
         end = float(trajectory.times[-1])
         if references is not None:
             period = end / len(trajectory.times)
-            begun, ended = references.t0 >= run.zero - period, references.t1 <= run.zero + end + LATE
-            if whole:
-                begun, ended = begun | np.isneginf(references.t0), ended | np.isposinf(references.t1)
+            begun = (references.t0 >= run.zero - period) | (np.isneginf(references.t0) & whole)
+            ended = (references.t1 <= run.zero + end + LATE) | (np.isposinf(references.t1) & whole)
             known = trajectory.has_poses or (references.start_known and whole)
             references = references.only(begun & ended).of_run(run.zero, end)
             instant = references.t0 == references.t1

@@ -8,13 +8,11 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from omnibench.errors import DataError
-
-T = TypeVar("T")
 
 
 def temporary_file(ending: str) -> Any:
@@ -27,27 +25,36 @@ def temporary_file(ending: str) -> Any:
     return file
 
 
-class Scratch:
-    """A temporary file that objects are appended to; a copy in another process only reads it."""
+class Scratch(Sequence[Any]):
+    """A temporary file that objects are appended to, each of which is read whenever it is asked for.
+
+    path: of the file in another process, which only reads it.
+    """
 
     def __init__(self, path: Path | None = None) -> None:
         if path is None:
             self._file = temporary_file(".scratch")
-        self._path = path or Path(self._file.name)
+        self._path, self._offsets = path or Path(self._file.name), list[int]()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Scratch, (self._path,)
 
-    def stored(self, value: T) -> Callable[[], T]:
+    def __getitem__(self, index: Any) -> Any:
+        return self._read(self._offsets[index])
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def stored(self, value: Any) -> Callable[[], Any]:
         """A function that reads the value, which from now on lies in the file. DataError: the disk refuses."""
-        offset = self._file.tell()
+        self._offsets.append(self._file.tell())
         try:
             pickle.dump(value, self._file, protocol=pickle.HIGHEST_PROTOCOL)
             self._file.flush()
         except OSError as error:
             way = "set TMPDIR to a folder with more space"
             raise DataError(f"{self._path}: cannot be written: {error.strerror or error}; {way}") from None
-        return partial(self._read, offset)
+        return partial(self._read, self._offsets[-1])
 
     def _read(self, offset: int) -> Any:
         """The object at an offset. DataError: the file is gone."""
@@ -62,19 +69,8 @@ class Scratch:
             return value.view(np.dtype(value.dtype.str))
         return value
 
-    def sequence(self, values: Iterable[T]) -> StoredSequence[T]:
+    def sequence(self, values: Iterable[Any]) -> Scratch:
         """The values, of which one is in memory at a time."""
-        return StoredSequence([self.stored(value) for value in values])
-
-
-class StoredSequence(Sequence[T]):
-    """Objects in a temporary file, each of which is read whenever it is asked for."""
-
-    def __init__(self, items: Sequence[Callable[[], T]]) -> None:
-        self._items = items
-
-    def __getitem__(self, index: Any) -> Any:
-        return StoredSequence(self._items[index]) if isinstance(index, slice) else self._items[index]()
-
-    def __len__(self) -> int:
-        return len(self._items)
+        for value in values:
+            self.stored(value)
+        return self

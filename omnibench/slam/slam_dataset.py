@@ -102,7 +102,7 @@ def path_warnings(matches: Sequence[Match], options: SlamOptions, odometry: Arra
     weak = [match.observability.min() < _DEGENERATE for match in matches]
     if any(lost):
         yield PathWarning("less than a fifth of a scan lies on the map, and its pose is the start of the search")
-    degenerate = [match for match, at_sea, vague in zip(matches, lost, weak, strict=True) if vague and not at_sea]
+    degenerate = [match for match, is_lost, is_weak in zip(matches, lost, weak, strict=True) if is_weak and not is_lost]
     if len(degenerate) > _OFTEN * len(matches):
         x, y, heading = np.array([match.directions[:, match.observability.argmin()] for match in degenerate]).T
         if (np.abs(heading) > np.hypot(x, y)).mean() > 0.5:
