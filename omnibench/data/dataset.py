@@ -290,7 +290,7 @@ def make_dataset(
     if wheels is None and (trajectories is None or poses is not None or references is not None):
         raise DataError(f"data set {name}: wheels is missing: a table with the columns t and omega_<wheel>")
     if wheels is not None and poses is None and references is None:
-        raise DataError(f"data set {name}: poses is missing: a table with t, x, y and theta; or references, measured")
+        raise DataError(f"data set {name}: poses is missing: a table with t, x, y and theta; or references (distances)")
     if not isinstance(sample_period, Real | None):
         raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
     if wheels is None:

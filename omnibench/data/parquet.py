@@ -119,7 +119,7 @@ def sink_frames(
                 table.sink_csv(opened, maintain_order=True)
             else:
                 table.sink_parquet(opened, row_group_size=rows, maintain_order=True)
-    except pl.exceptions.PolarsError as error:
+    except (pl.exceptions.PolarsError, OSError) as error:
         if number := re.search(r"\(os error (\d+)\)", str(error)):
             raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
-        raise OSError(errno.EIO, str(error)) from None
+        raise (error if isinstance(error, OSError) else OSError(errno.EIO, str(error))) from None
