@@ -4,46 +4,37 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # that of ``typing`` would take its import, during which Ctrl-C prints a traceback
 
-# The public names and their modules. A name is imported when it is first asked for, so that the command line starts at
-# once.
-_PUBLIC = {
-    "Budget": "fit.settings",
-    "Calibration": "robot.calibration",
-    "Dataset": "data.dataset",
-    "FitSettings": "fit.settings",
-    "LiveNode": "live.node",
-    "OmnibenchError": "errors",
-    "Reference": "data.references",
-    "References": "data.references",
-    "Robot": "robot.kinematics",
-    "Trajectory": "data.dataset",
-    "Wheel": "robot.kinematics",
-    "calibrate": "fit.calibrate",
-    "check": "check.check",
-    "certify_optimum": "fit.certify",
-    "design_experiment": "design.design",
-    "discover_effects": "discover.discover",
-    "evaluate": "fit.evaluate",
-    "export_calibration": "robot.export.formats",
-    "import_dataset": "slam.import_dataset",
-    "inspect_dataset": "fit.inspect",
-    "load_dataset": "data.storage",
-    "load_plugins": "registry",
-    "make_dataset": "data.dataset",
-    "odometry": "robot.dead_reckoning",
-    "read_calibration": "robot.calibration",
-    "read_compare_config": "compare.config",
-    "read_live_config": "live.config",
-    "read_simulation": "simulate.source",
-    "read_tum": "data.importers.tum",
-    "run_comparison": "compare.run",
-    "save_dataset": "data.storage",
-    "simulate_dataset": "simulate.source",
-    "subscribe": "live.wire.subscriber",
-    "write_calibration": "robot.calibration",
-    "write_tum": "data.importers.tum",
+# Modules with the public names in them. A name is imported when it is first asked for, so that the command line starts
+# at once.
+_MODULES = {
+    "check.check": "check",
+    "compare.config": "read_compare_config",
+    "compare.run": "run_comparison",
+    "data.dataset": "Dataset Trajectory make_dataset",
+    "data.importers.tum": "read_tum write_tum",
+    "data.references": "Reference References",
+    "data.storage": "load_dataset save_dataset",
+    "design.design": "design_experiment",
+    "discover.discover": "discover_effects",
+    "errors": "OmnibenchError",
+    "fit.calibrate": "calibrate",
+    "fit.certify": "certify_optimum",
+    "fit.evaluate": "evaluate",
+    "fit.inspect": "inspect_dataset",
+    "fit.settings": "Budget FitSettings",
+    "live.config": "read_live_config",
+    "live.node": "LiveNode",
+    "live.wire.subscriber": "subscribe",
+    "registry": "load_plugins",
+    "robot.calibration": "Calibration read_calibration write_calibration",
+    "robot.dead_reckoning": "odometry",
+    "robot.export.formats": "export_calibration",
+    "robot.kinematics": "Robot Wheel",
+    "simulate.source": "read_simulation simulate_dataset",
+    "slam.import_dataset": "import_dataset",
 }
-__all__ = list(_PUBLIC)
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_PUBLIC)
 
 __version__: str  # of the installed package, "unknown" in a folder of source files that is not installed
 

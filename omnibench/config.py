@@ -116,7 +116,7 @@ class _Dumper(yaml.SafeDumper):
 class _Document:
     """Reader of a YAML text that makes values of the parser's events, without aliases, tags and directives.
 
-    most: values that it may have. YAMLError names the line of what is not read; ConfigError: a key is there twice.
+    most: values that it may have. YAMLError names the line of what is not read, such as a key that is there twice.
     """
 
     def __init__(self, text: str, most: int) -> None:
@@ -164,7 +164,7 @@ class _Document:
             if key == "<<" and event.implicit[0]:
                 raise yaml.YAMLError(f"{_line(event)}: merge keys (<<) are not read; write the keys out")
             if key in mapping:
-                raise ConfigError(f"{_line(event)}: key {shown(key)} is given twice")
+                raise yaml.YAMLError(f"{_line(event)}: key {shown(key)} is given twice")
             mapping[key] = self._node(next(self._events), depth + 1)
         return mapping
 
@@ -189,8 +189,6 @@ def parse_yaml(text: str, where: str, most: int = MOST_VALUES) -> Any:
     """
     try:
         return _Document(text, most).content()
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date or number such as 2023-99-99
         mark = getattr(error, "problem_mark", None)
         problem = error if mark is None else f"line {mark.line + 1}: {getattr(error, 'problem', error)}"
@@ -253,15 +251,9 @@ def to_json(document: BaseModel | Mapping[str, Any]) -> str:
 
 def as_yaml(value: Any) -> str:
     """A value as ``--set`` takes it."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, str):
         plain = value and all(letter.isalnum() or letter in "._/*-" for letter in value) and value[0] != "*"
         return value if plain and parse_yaml(value, "value") == value else json.dumps(value)
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    if isinstance(value, Mapping):
-        return json.dumps(value)
     if isinstance(value, list | tuple):
         return f"[{','.join(as_yaml(item) for item in value)}]"
-    return str(value)
+    return json.dumps(int(value) if isinstance(value, float) and value.is_integer() else value)

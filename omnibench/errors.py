@@ -33,16 +33,6 @@ _LINEAR_ALGEBRA = ("numpy.linalg", "numpy.linalg.linalg", "_flapack")  # modules
 _LONGEST = 2000  # characters of a message; a plug-in's may have millions (chosen: a screen of a terminal)
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 61  # 61: too long, shown by its type
-_MORE_SPACE = "free space or choose another place"
-_MORE_RIGHTS = "get permission to write there or choose another place"
-_WAYS_OUT = {
-    ENOSPC: _MORE_SPACE,
-    EDQUOT: _MORE_SPACE,
-    EFBIG: _MORE_SPACE,
-    EIO: _MORE_SPACE,  # polars reports a full disk as an error of input or output
-    EACCES: _MORE_RIGHTS,
-    EPERM: _MORE_RIGHTS,
-}
 
 
 def one_line(text: str) -> str:
@@ -68,9 +58,9 @@ def shown(value: object) -> str:
     if isinstance(value, int) and value.bit_length() > 200:
         return "a whole number of more than 60 digits"
     words = _SHORT.repr(value)
-    if len(words) <= 60:
-        return words
-    return f"{type(value).__name__} of {len(value):,}" if isinstance(value, Sized) else type(value).__name__
+    if len(words) > 60:
+        words = f"{type(value).__name__} of {len(value):,}" if isinstance(value, Sized) else type(value).__name__
+    return words
 
 
 class OmnibenchError(Exception):
@@ -171,7 +161,11 @@ def not_written(path: Path, error: OSError) -> DataError:
         return DataError(f"{path}: cannot be written: is a folder; name a file")
     if error.errno in (EEXIST, ENOTDIR):
         return DataError(f"{path}: cannot be written: {path.parent} is not a folder; choose another place")
-    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
+    way_out = "choose another place"
+    if error.errno in (ENOSPC, EDQUOT, EFBIG, EIO):  # polars reports a full disk as an error of input or output
+        way_out = f"free space or {way_out}"
+    elif error.errno in (EACCES, EPERM):
+        way_out = f"get permission to write there or {way_out}"
     return DataError(f"{path}: cannot be written: {error.strerror or error}; {way_out}")
 
 

@@ -97,27 +97,38 @@ def replacing(path: Path) -> Iterator[Path]:
     path = resolved(path)  # a link goes on pointing to the file
     special = path.exists() and not path.is_file()  # a device or a pipe is written to, never replaced
     partial = path if special else path.with_name(f".{path.name}.{os.getpid()}.partial")
-    made = [folder for folder in path.parents if not folder.exists()]
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        if special:
-            return
-        replaced = path.exists()
-        if replaced:
-            _to_disk(partial)
-        partial.replace(path)
-        if replaced:
-            with suppress(OSError):  # a file system that cannot, or a folder that cannot be read
-                _to_disk(path.parent)
+        with _folder_made(path.parent, None if special else partial):
+            yield partial
+            if special:
+                return
+            replaced = path.exists()
+            if replaced:
+                _to_disk(partial)
+            partial.replace(path)
+            if replaced:
+                with suppress(OSError):  # a file system that cannot, or a folder that cannot be read
+                    _to_disk(path.parent)
     except OSError as error:
         raise not_written(path, error) from None
+
+
+@contextmanager
+def _folder_made(folder: Path, leftover: Path | None = None) -> Iterator[None]:
+    """Make a folder and those above it that are missing; when the block ends, those that are still empty go again.
+
+    leftover: a file that is removed before, if it is there.
+    """
+    missing = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
         with suppress(OSError):
-            if not special:
-                partial.unlink(missing_ok=True)
-            for folder in made:  # they stay unless empty
-                folder.rmdir()
+            if leftover is not None:
+                leftover.unlink(missing_ok=True)
+            for parent in missing:
+                parent.rmdir()
 
 
 def _to_disk(path: Path) -> None:
@@ -140,14 +151,14 @@ def results_locked(folder: Path) -> Iterator[None]:
         return
     import fcntl
 
-    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     check_place(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise not_written(folder, error) from None
-    try:
+    with ExitStack() as lock:
+        try:
+            lock.enter_context(_folder_made(folder))
+            descriptor = os.open(folder, os.O_RDONLY)
+        except OSError as error:
+            raise not_written(folder, error) from None
+        lock.callback(os.close, descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -156,14 +167,7 @@ def results_locked(folder: Path) -> Iterator[None]:
             ) from None
         except OSError:
             pass  # a file system without locks
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # folders stay unless they are empty
-                for parent in made:
-                    parent.rmdir()
-    finally:
-        os.close(descriptor)
+        yield
 
 
 def refuse_existing(*paths: Path | None, force: bool, folders: bool = False) -> None:
@@ -289,9 +293,7 @@ def check_results_folder(folder: Path, mark: str, kind: str, *, force: bool = Fa
     except DataError:
         ours = False
     if not ours:
-        raise DataError(
-            f"{folder}: holds other files; name a new folder, or one of an earlier {kind}, or --force to write there"
-        )
+        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier {kind}, or --force")
 
 
 def new_results_folder(parent: Path) -> Path:

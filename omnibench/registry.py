@@ -117,9 +117,7 @@ class Registry(Generic[T]):
         def decorate(cls: C) -> C:
             registered = self._entries.get(name)
             if registered is not None and registered.cls is not cls:
-                raise PluginError(
-                    f"{self.kind} {name!r} is registered already, by {registered.origin}; choose another name"
-                )
+                raise PluginError(f"{self.kind} {name!r} is registered already, by {registered.origin}; rename it")
             if self.contract not in cls.__mro__:
                 raise PluginError(f"{self.kind} {name!r}: the class must derive from {self.contract.__name__}")
             options = getattr(cls, "Options", Options)
@@ -291,9 +289,7 @@ def _limited_time(path: Path) -> Iterator[None]:
         return
 
     def over(number: int, frame: object) -> None:  # noqa: ARG001 (a handler of signals)
-        raise PluginError(
-            f"{path}: it is not imported within {_IMPORT_SECONDS:g} s; what takes long belongs in a method"
-        )
+        raise PluginError(f"{path}: is not imported within {_IMPORT_SECONDS:g} s; what takes long belongs in a method")
 
     before = signal.signal(signal.SIGALRM, over)
     signal.setitimer(signal.ITIMER_REAL, _IMPORT_SECONDS, 1.0)  # again if the file catches it

@@ -67,14 +67,14 @@ class Shown:
     """A mixin for results: a short text, tables as Polars data frames and a Plotly figure."""
 
     def __repr__(self) -> str:
-        return "\n".join(self._lines())
+        return "\n".join(screenful(_view(self).lines()))
 
     def __str__(self) -> str:
         return repr(self)
 
     def _repr_html_(self) -> str:
         """The text and the head of the first table, for notebooks."""
-        first, *others = map(escape, self._lines())
+        first, *others = map(escape, screenful(_view(self).lines()))
         below = "".join(f"<br>{line}" for line in others)
         table = next(iter(_view(self).tables().values()))()
         return f"<div><b>{first}</b>{below}</div>{table.head(_ROWS)._repr_html_()}"
@@ -110,9 +110,6 @@ class Shown:
         for option in sorted(options):
             require_choice("option of plot", option, parameters)
         return view.figure(**options)
-
-    def _lines(self) -> list[str]:
-        return screenful(_view(self).lines())
 
 
 def as_pandas(frame: pl.DataFrame) -> Any:

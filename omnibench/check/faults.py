@@ -19,8 +19,7 @@ from omnibench.check.hypotheses import another_zero, wheels_in_words
 from omnibench.check.streams import SAME, looks_of, pose_period
 from omnibench.data.dataset import Trajectory
 from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
-from omnibench.data.importers.copied_reference import follows_the_wheels
-from omnibench.data.jumps import reference_jumps
+from omnibench.data.spoiled_references import follows_the_wheels, reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
 from omnibench.robot.kinematics import CarDrive
 from omnibench.words import plural, some

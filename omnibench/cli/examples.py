@@ -69,7 +69,7 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
     write_files(missing)
     if recording is None:
         return list(missing)
-    from omnibench.simulate.simulation_request import SimulationRequest
+    from omnibench.simulate.source import SimulationRequest
 
     SimulationRequest(recording, folder / example.files[0], force=force).write("csv")
     return [*missing, recording]

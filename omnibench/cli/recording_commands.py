@@ -568,7 +568,7 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.simulate.simulation_request import SimulationRequest
+    from omnibench.simulate.source import SimulationRequest
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)

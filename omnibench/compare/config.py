@@ -14,10 +14,10 @@ from omnibench.data.dataset import Split
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
 from omnibench.fit.calibrator import as_answered, unloadable
 from omnibench.fit.geometry import GeometryLimits
+from omnibench.fit.intervals import Bootstrap
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.prior import MountChoice
-from omnibench.fit.ratio_intervals import Bootstrap
 from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, FitSettings, objective_in_words
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw

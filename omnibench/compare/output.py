@@ -18,7 +18,7 @@ from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import calibration_of_fit
-from omnibench.fit.ratio_intervals import Interval
+from omnibench.fit.intervals import Interval
 from omnibench.robot.calibration import Calibration, ModelExtension, Row, covariance_rows, write_calibration
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.

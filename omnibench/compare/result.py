@@ -16,9 +16,9 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split
 from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome
+from omnibench.fit.intervals import Clusters, Interval
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Improvement
-from omnibench.fit.ratio_intervals import Interval, Units
 from omnibench.fit.uncertainty import Uncertainty
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, ModelExtension, Noise, Row
@@ -114,7 +114,7 @@ class SplitScore:
     cost: float
     costs: Array
     errors: Array
-    units: Units
+    units: Clusters
     rounding: float
 
 

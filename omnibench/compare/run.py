@@ -39,8 +39,8 @@ from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.evaluate import final_errors, positions_and_headings
 from omnibench.fit.geometry import WheelGeometry, searched_parameters
 from omnibench.fit.identifiability import warnings_of_calibration
+from omnibench.fit.intervals import UnitName, units_of
 from omnibench.fit.parameterisation import make_bounds
-from omnibench.fit.ratio_intervals import UnitName, units_of
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.fit.span import Treatment, driven_span
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
@@ -56,7 +56,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.robot.stored_odometry import odometry_of
-from omnibench.simulate.robot_config import RobotConfig
+from omnibench.simulate.config import RobotConfig
 from omnibench.slam.slam_options import PRELOAD as SLAM_PRELOAD
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.evaluate import judge, nothing_held_out
-from omnibench.fit.ratio_intervals import Bootstrap, Interval, RatioIntervals
+from omnibench.fit.intervals import Bootstrap, Interval, RatioIntervals
 from omnibench.fit.sessions import compare_sessions
 from omnibench.registry import calibrators
 from omnibench.robot.model import OdometryModel

@@ -64,6 +64,7 @@ _AWAY, _TOLD = 0.5, 0.2
 # drives that tell a clock 80 or more.
 _CHANGES = 3.0
 _FINE = 60  # ticks in a sample at most, of counters that are coarse; chosen
+_NOW = np.zeros(1)  # s
 _RANK = 1e-3  # of the strongest direction of the signals: what is weaker is noise; chosen
 
 
@@ -111,8 +112,7 @@ class ClockMatch:
 
     def corrected(self, pose_times: Array) -> Array:
         """Pose times (K,) by the wheels' clock, s, Eq. (1)."""
-        times: Array = pose_times + self.offset + self.drift * (pose_times - pose_times[0])
-        return times
+        return np.asarray(pose_times + self.offset + self.drift * (pose_times - pose_times[0]))
 
 
 def match_clocks(robot: Robot, runs: Sequence[Streams], search: float = SEARCH) -> list[ClockMatch | None]:
@@ -133,7 +133,13 @@ def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Arr
     """The coefficients h and s, and the clocks, that fit runs best together."""
     clocks = [each.scanned(search) for each in windows]
     for _ in range(ROUNDS):
-        fitted, before = _coefficients(windows, clocks), clocks
+        before, within = clocks, [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
+        changes = [each.columns(clock)[0] for each, clock in zip(windows, clocks, strict=True)]
+        fitted = []  # the coefficients that fit all runs best by their clocks
+        for row, channel in enumerate(windows[0].channels):
+            columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
+            shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
+            fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
         pairs = zip(windows, before, clocks, strict=True)
         if max(each.farthest_step(*np.subtract(old, new)) for each, old, new in pairs) < _SETTLED:
@@ -150,14 +156,15 @@ class Windows:
     """The windows of a run: first and last (W,) of its bins, and what the reference shows between them.
 
     edges (F + 1,), counted (F + 1, C): times, s, and integrals of the signals, then of the design's speed and of the
-    signals' magnitudes. stamps (K,): s. starts (B,): first stamp of each bin. shown (2, W): change of heading, rad, and
-    way, m. heading: number of the columns that tell the heading. tick: usual time of one, s; 0 of fine counters.
+    signals' magnitudes. channels: the columns that tell the heading, and those that tell the way. stamps (K,): s.
+    starts (B,): first stamp of each bin. shown (2, W): change of heading, rad, and way, m. tick: usual time of one, s;
+    0 of fine counters.
     steers: the way alone tells the clock, since wheels may follow their steering angles late.
     """
 
     edges: Array
     counted: Array
-    heading: int
+    channels: tuple[slice, slice]
     stamps: Array
     starts: NDArray[np.intp]
     first: NDArray[np.intp]
@@ -189,8 +196,8 @@ class Windows:
         counted = np.hstack([run.driven, np.vstack([np.zeros(speeds.shape[1]), np.cumsum(speeds, axis=0)])])
         shown = np.array([moved[:, 2], np.hypot(moved[:, 0], moved[:, 1])])
         tick = _tick_time(driven, np.diff(run.edges))
-        steers = bool(robot.drive.steered)
-        return cls(run.edges, counted, driven.shape[1], run.pose_times, starts, first, last, shown, tick, steers)
+        channels, steers = (slice(0, driven.shape[1]), slice(driven.shape[1], None)), bool(robot.drive.steered)
+        return cls(run.edges, counted, channels, run.pose_times, starts, first, last, shown, tick, steers)
 
     @property
     def middle(self) -> float:
@@ -206,37 +213,32 @@ class Windows:
         """The most, s, that a step of the clock moves a stamp of the run."""
         return abs(float(offset)) + abs(float(drift)) * self.length / 2
 
-    def columns(self, clock: Clock, later: Array) -> Array:
+    def columns(self, clock: Clock, later: Array = _NOW) -> Array:
         """Changes (L, W, C) of what the wheels count over the windows, ``later`` (L,), s, than by a clock."""
-        taken = self._taken(self.stamps, clock) + later[:, None]
+        taken = self._taken(clock) + later[:, None]
         means = _means(_between(taken, self.edges, self.counted), self.starts)
-        changes: Array = means[:, self.last] - means[:, self.first]
-        return changes
+        return np.asarray(means[:, self.last] - means[:, self.first])
 
-    def _taken(self, stamps: Array, clock: Clock) -> Array:
-        taken: Array = stamps + clock[0] + clock[1] * (stamps - self.middle)
+    def _taken(self, clock: Clock) -> Array:
+        """When the poses (K,) were taken by a clock, s."""
+        taken: Array = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle)
         return taken
 
     def within(self, clock: Clock) -> NDArray[np.bool_]:
         """True (W,) for windows that lie within the wheels' samples by a clock."""
-        return self._inside(self._taken(self.stamps[self.starts], clock))
+        return self._inside(self._taken(clock)[self.starts])
 
     def _inside(self, taken: Array) -> NDArray[np.bool_]:
         """True (..., W) for windows whose bins begin, at times (..., B), within the wheels' samples."""
         inside = (taken >= self.edges[0]) & (taken <= self.edges[-1] - _BIN)
-        both: NDArray[np.bool_] = inside[..., self.first] & inside[..., self.last]
-        return both
-
-    def channels(self) -> tuple[slice, slice]:
-        """The columns that tell the heading, and those that tell the way."""
-        return slice(0, self.heading), slice(self.heading, None)
+        return np.asarray(inside[..., self.first] & inside[..., self.last])
 
     def scanned(self, search: float, fitted: Sequence[Array] | None = None) -> Clock:
         """The offset by which the run itself fits best, with coefficients of its own unless some are given."""
         steps = int(np.ceil(search / _COARSE))
         offsets = np.arange(-steps, steps + 1) * _COARSE
         parts = np.array_split(offsets, -(-len(offsets) * len(self.starts) // _MOST_BINS))
-        return float(offsets[int(np.argmin(np.concatenate([self._unexplained(part, fitted) for part in parts])))]), 0.0
+        return float(offsets[np.concatenate([self._unexplained(part, fitted) for part in parts]).argmin()]), 0.0
 
     def _unexplained(self, offsets: Array, fitted: Sequence[Array] | None) -> Array:
         """Products (L,) of the shares of heading and way that the wheels do not explain by offsets (L,), s.
@@ -248,7 +250,7 @@ class Windows:
         counts = _between(moments + offsets[:, None], self.edges, self.counted)
         columns = counts[:, self.last] - counts[:, self.first]
         shares = np.ones(len(offsets))
-        for number, (channel, shown) in enumerate(zip(self.channels(), self.shown, strict=True)):
+        for number, (channel, shown) in enumerate(zip(self.channels, self.shown, strict=True)):
             wanted = np.where(within, shown, 0.0)
             told = columns[..., channel]
             solved = _solved(told, wanted, within) if fitted is None else fitted[number]
@@ -269,7 +271,7 @@ class Windows:
         by the drift, which the moments tell at which the motion changes.
         """
         before, now, after = self.columns(clock, np.array([-_DELTA, 0.0, _DELTA]))
-        left = self._left(fitted, now)
+        left = self.shown - self._explained(fitted, now)
         deviations = (self._deviations(left, clock) if deviations is None else deviations)[:, None]
         residuals = left / deviations
         weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)) * self.within(clock)
@@ -283,11 +285,7 @@ class Windows:
 
     def _explained(self, fitted: Sequence[Array], columns: Array) -> Array:
         """Changes (2, W), rad and m, that changes (W, C) of the wheels' counts explain."""
-        return np.array([columns[:, channel] @ each for channel, each in zip(self.channels(), fitted, strict=True)])
-
-    def _left(self, fitted: Sequence[Array], columns: Array) -> Array:
-        left: Array = self.shown - self._explained(fitted, columns)
-        return left
+        return np.array([columns[:, channel] @ each for channel, each in zip(self.channels, fitted, strict=True)])
 
     def _deviations(self, left: Array, clock: Clock) -> Array:
         """Robust standard deviations (2,) of what is left (2, W)."""
@@ -297,7 +295,7 @@ class Windows:
 
     def improved(self, fitted: Sequence[Array], clock: Clock, steps: int = _STEPS) -> Clock:
         """The clock after some steps of Gauss-Newton, which are halved until the run fits better."""
-        deviations = self._deviations(self._left(fitted, self.columns(clock, np.zeros(1))[0]), clock)
+        deviations = self._deviations(self.shown - self._explained(fitted, self.columns(clock)[0]), clock)
         for _ in range(steps):
             residuals, weights, derivatives = self._system(fitted, clock, deviations)
             design = derivatives.reshape(len(derivatives), -1)
@@ -320,7 +318,7 @@ class Windows:
 
     def _cost(self, fitted: Sequence[Array], clock: Clock, deviations: Array, counted: NDArray[np.bool_]) -> float:
         """Huber's loss of the windows (W,) that count by a clock, with gains of both channels that fit this run."""
-        explained = self._explained(fitted, self.columns(clock, np.zeros(1))[0]) / deviations[:, None]
+        explained = self._explained(fitted, self.columns(clock)[0]) / deviations[:, None]
         left = self.shown / deviations[:, None] - explained
         weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(left), 1e-12)) * counted
         gains = (weights * left * explained).sum(axis=1) / np.maximum((weights * explained**2).sum(axis=1), 1e-300)
@@ -329,7 +327,7 @@ class Windows:
     def _told(self, fitted: Sequence[Array], clock: Clock) -> bool:
         """True if the motion changes by more than it scatters, and other offsets fit clearly worse."""
         now, *others = self.columns(clock, np.array([0.0, -_AWAY, _AWAY]))
-        present, counted = self._left(fitted, now), self.within(clock)
+        present, counted = self.shown - self._explained(fitted, now), self.within(clock)
         deviations = self._deviations(present, clock)[:, None]
         changing = (self._explained(fitted, now)[:, counted] / deviations).std(axis=1)
         if changing[int(self.steers) :].max() < _CHANGES:
@@ -339,7 +337,7 @@ class Windows:
             both = counted & self.within((clock[0] + away, clock[1]))
             if both.sum() < _FEWEST:
                 return False
-            left = self._left(fitted, columns) / deviations
+            left = (self.shown - self._explained(fitted, columns)) / deviations
             cost, least = (float(_huber(each[int(self.steers) :, both]).sum()) for each in (left, best))
             if cost - least <= _TOLD * least:  # both are 0 where the reference stands still
                 return False
@@ -393,23 +391,10 @@ def _tick_time(driven: Array, durations: Array) -> float:
     return float(np.median(intervals / busiest[counted[1:]]) * moved.min()) if len(intervals) else 0.0
 
 
-def _coefficients(windows: Sequence[Windows], clocks: Sequence[Clock]) -> list[Array]:
-    """The coefficients h and s of Eq. (2) and (3) that fit all runs best by their clocks."""
-    fitted = []
-    within = [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
-    changes = [each.columns(clock, np.zeros(1))[0] for each, clock in zip(windows, clocks, strict=True)]
-    for row, channel in enumerate(windows[0].channels()):
-        columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
-        shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
-        fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
-    return fitted
-
-
 def _huber(residuals: Array) -> Array:
     """Huber's loss of residuals in their standard deviations."""
     sizes = np.abs(residuals)
-    loss: Array = np.where(sizes < _HUBER, sizes**2 / 2, _HUBER * sizes - _HUBER**2 / 2)
-    return loss
+    return np.where(sizes < _HUBER, sizes**2 / 2, _HUBER * sizes - _HUBER**2 / 2)
 
 
 def _solved(columns: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
@@ -435,8 +420,7 @@ def _weighted(columns: Array, wanted: Array, weights: Array) -> Array:
     values, vectors = np.linalg.eigh(turned @ columns)
     driven = values > _RANK**2 * np.maximum(values[..., -1:], 1e-300)
     along = (np.swapaxes(vectors, -1, -2) @ (turned @ wanted[..., None]))[..., 0]
-    solution: Array = (vectors @ (np.where(driven, along / np.where(driven, values, 1.0), 0.0))[..., None])[..., 0]
-    return solution
+    return np.asarray((vectors @ (np.where(driven, along / np.where(driven, values, 1.0), 0.0))[..., None])[..., 0])
 
 
 def _median(sizes: Array, counted: NDArray[np.bool_]) -> Array:
@@ -446,23 +430,20 @@ def _median(sizes: Array, counted: NDArray[np.bool_]) -> Array:
     pair = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, sizes.shape[-1] - 1)], axis=-1)
     if not sizes.shape[-1]:
         return np.zeros(count.shape)
-    middle: Array = np.where(count > 0, np.take_along_axis(ordered, pair, axis=-1).mean(axis=-1), 0.0)
-    return middle
+    return np.where(count > 0, np.take_along_axis(ordered, pair, axis=-1).mean(axis=-1), 0.0)
 
 
 def _between(times: Array, edges: Array, rows: Array) -> Array:
     """Rows (..., n) at times (...), by straight lines between the rows (F + 1, n) at the edges; held beyond."""
     after = np.clip(np.searchsorted(edges, times), 1, len(edges) - 1)
     share = np.clip((times - edges[after - 1]) / (edges[after] - edges[after - 1]), 0.0, 1.0)[..., None]
-    between: Array = rows[after - 1] * (1 - share) + rows[after] * share
-    return between
+    return np.asarray(rows[after - 1] * (1 - share) + rows[after] * share)
 
 
 def _means(values: Array, starts: NDArray[np.intp]) -> Array:
     """Means (..., B, n) of the rows of values (..., K, n) from each start to the next."""
     counts = np.diff(np.append(starts, values.shape[-2]))
-    means: Array = np.add.reduceat(values, starts, axis=-2) / counts[:, None]
-    return means
+    return np.asarray(np.add.reduceat(values, starts, axis=-2) / counts[:, None])
 
 
 _BUNCHED, _TOGETHER = 1.2, 10  # factor of the mean period from the median, and samples that it is taken over; chosen

@@ -89,8 +89,7 @@ def counted_on(counts: Array, wrap: float) -> Array:
         before = 0.0
         for index, step in enumerate(short.tolist()):
             before = short[index] = step + wrap * round((before - step) / wrap)
-    on: Array = counts - wrap * np.cumsum(np.round((steps - short) / wrap))
-    return on
+    return np.asarray(counts - wrap * np.cumsum(np.round((steps - short) / wrap)))
 
 
 def jumping_readings(counts: Array, times: Array) -> NDArray[np.bool_]:
@@ -199,8 +198,7 @@ def about_zero(shown: Array, turn: float) -> Array:
     on = counted_on(shown, turn)
     if shown.min() < 0 or shown.max() > turn:  # it counts both ways
         return on
-    middle: Array = on - turn * np.round(np.median(on) / turn)
-    return middle
+    return np.asarray(on - turn * np.round(np.median(on) / turn))
 
 
 def repeated_readings(times: Array, counts: Array, steering: Array | None) -> NDArray[np.bool_]:

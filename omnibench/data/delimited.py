@@ -11,15 +11,14 @@ import re
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from io import BytesIO, TextIOWrapper
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-import polars.selectors as cs
 from numpy.typing import NDArray
 
 from omnibench.data.parquet import readable, scan_table, seconds
@@ -34,7 +33,6 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 LARGE = 1 << 26  # bytes of a text whose numbers are not held in memory together, where they take six times as much
 _COMMAS = " (decimal commas? --set decimal=comma with --set separator)"
 _HEAD = 1 << 16  # characters in which the header and the first rows stand; chosen
-_FIRST = 30  # rows among which those of numbers begin; chosen
 _HEADED = 1000  # lines that tell the types of the columns; chosen
 _MOST_BYTES = 1 << 34  # of a table; chosen
 _AT_ONCE = 1_000_000  # rows of which several columns are read at a time; chosen
@@ -56,10 +54,6 @@ Lines = Sequence[int] | NDArray[np.intp]
 """Numbers of lines of a file, from 1."""
 
 
-Source = Path | BytesIO | Any
-"""What polars reads: a file, a text in memory, or a temporary file."""
-
-
 class ColumnError(DataError):
     """A table has not the columns that are expected of it."""
 
@@ -74,7 +68,8 @@ class Table:
 
     names: of the columns, numbers from 1 where there is no header. read: gives the columns in their order, when rows
     are asked for. lines (rows,): of the file that a row came from, and perhaps further ones. units: those of a row
-    below the header. headed: the names come from a header.
+    below the header. headed: the names come from a header. lines_above: number of the file's lines above its first row
+    of numbers, where texts stand between it and the header.
     """
 
     file: Path
@@ -83,6 +78,7 @@ class Table:
     lines: Lines
     units: tuple[str, ...] = ()
     headed: bool = True
+    lines_above: int = 0
 
     @cached_property
     def frame(self) -> pl.LazyFrame:
@@ -107,15 +103,12 @@ class Table:
 
     def by_text(self, name: str) -> dict[str, Table]:
         """The rows that have the same text in a column, in their order, by that text, the first first."""
-        column = pl.nth(self._place(name))
-        begins = column.ne_missing(column.shift()) | (pl.int_range(pl.len()) == 0)
-        stretches = self._selected(
-            pl.int_range(pl.len()).filter(begins).alias("first"), column.filter(begins).alias("text")
-        )
-        edges = [*stretches["first"].to_list(), len(self)]
+        stretches = self._column(name).rle().struct.unnest()
         parts: dict[str, list[NDArray[np.intp]]] = {}
-        for text, (first, end) in zip(_texts(stretches["text"]), pairwise(edges), strict=True):
-            parts.setdefault(text, []).append(np.arange(first, end))
+        end = 0
+        for text, length in zip(_texts(stretches["value"]), stretches["len"], strict=True):
+            parts.setdefault(text, []).append(np.arange(end, end + length))
+            end += length
         return {text: self.only(np.concatenate(rows)) for text, rows in parts.items()}
 
     def only(self, rows: NDArray[np.intp]) -> Table:
@@ -129,16 +122,9 @@ class Table:
 
         return replace(self, read=chosen, lines=lines)
 
-    def lines_above(self) -> int:
-        """Number of the file's lines above its first row of numbers, where texts stand between it and the header."""
-        for row, cells in enumerate(self._selected(pl.all().head(_FIRST)).iter_rows()):
-            if 2 * sum(cell is not None and _is_float(str(cell)) for cell in cells) >= len(cells):
-                return int(self.lines[row]) - 1 if row else 0
-        return 0
-
     def unit_of(self, name: str) -> str:
         """The unit that stands below a column's name; empty without one."""
-        return self.units[self._place(name)] if self.units else ""
+        return self.units[_place(self.file, name, self.names)] if self.units else ""
 
     def fail(self, row: int, what: str) -> DataError:
         """The error of one row (0 is the first)."""
@@ -146,28 +132,25 @@ class Table:
 
     def texts(self, name: str) -> list[str]:
         """One column as texts; whole numbers without a decimal point."""
-        return _texts(self._selected(pl.nth(self._place(name))).to_series())
+        return _texts(self._column(name))
 
     def numbers(self, names: Sequence[str]) -> Array:
         """Columns as numbers (rows, n), NaN where a cell is blank. DataError: a cell holds something else."""
         numbers = np.empty((len(self), len(names)))
         step = len(names) if len(self) <= _AT_ONCE else 1
         for first in range(0, len(names), step):
-            chosen = enumerate(names[first : first + step], first)
-            columns = self._selected(
-                *(pl.nth(self._place(name)).alias(str(index)) for index, name in chosen),
-                then=(cs.string(), (~cs.string()).cast(pl.Float64).fill_null(np.nan)),
-            )
-            for column in columns.iter_columns():
-                index = int(column.name)
-                numbers[:, index] = self._parsed(names[index], column) if column.dtype == pl.String else column
+            chosen = names[first : first + step]
+            places = [_place(self.file, name, self.names) for name in chosen]
+            columns = self._selected(*(pl.nth(place).alias(str(index)) for index, place in enumerate(places)))
+            for index, (name, column) in enumerate(zip(chosen, columns.iter_columns(), strict=True), first):
+                numbers[:, index] = self._parsed(name, column)
         return numbers
 
     def check_finite(self, numbers: Array, names: Sequence[str], rows: NDArray[np.intp] | None = None) -> None:
         """DataError names the first cell among numbers (n, columns) that is none. rows (n,): of the table; or all."""
         for index, place in np.argwhere(~np.isfinite(numbers))[:1].tolist():
             row = index if rows is None else int(rows[index])
-            cell = self._selected(pl.nth(self._place(names[place])).slice(row, 1)).item()
+            cell = self._column(names[place])[row]
             flaw = f"is {str(cell).strip()}; remove or repair the row" if cell not in (None, "") else "is missing"
             raise self.fail(row, f"{names[place]} {flaw}")
 
@@ -184,16 +167,18 @@ class Table:
     def increasing(self, name: str) -> Array:
         """One column (rows,), which must increase; DataError names the first row that does not."""
         values = self.column(name)
-        flaw = not_increasing(values)
-        if flaw is not None:
+        if (flaw := not_increasing(values)) is not None:
             raise self.fail(flaw[0], f"{name} {flaw[1]}")
         return values
 
     def _parsed(self, name: str, column: pl.Series) -> Array:
-        """Texts as numbers; dates become seconds since 1970."""
-        cells = column.fill_null("").str.strip_chars()
-        numbers = cells.cast(pl.Float64, strict=False)
-        wrong = numbers.is_null() & ~cells.str.to_lowercase().is_in(BLANK)
+        """Numbers, or texts as such; dates become seconds since 1970."""
+        if column.dtype != pl.String:
+            numbers, wrong = column.cast(pl.Float64), pl.Series([False])
+        else:
+            cells = column.fill_null("").str.strip_chars()
+            numbers = cells.cast(pl.Float64, strict=False)
+            wrong = numbers.is_null() & ~cells.str.to_lowercase().is_in(BLANK)
         for form in _DATES if wrong.sum() * 2 > len(wrong) else ():
             zone = "UTC" if "z" in form else None
             with_zone = cells.str.replace("Z$", "+00:00")
@@ -203,19 +188,16 @@ class Table:
                 break
         if wrong.any():
             row = int(wrong.arg_true()[0])
-            text = cells[row]
-            hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(text) else ""
-            raise self.fail(row, f"{name} is {text!r}, expected a number{hint}")
-        floats: Array = numbers.fill_null(np.nan).to_numpy()
-        return floats
+            hint = "; of decimal commas say --set decimal=comma" if DECIMAL_COMMA.fullmatch(cells[row]) else ""
+            raise self.fail(row, f"{name} is {cells[row]!r}, expected a number{hint}")
+        return np.asarray(numbers.fill_null(np.nan).to_numpy())
 
-    def _place(self, name: str) -> int:
-        return _place(self.file, name, self.names)
+    def _column(self, name: str) -> pl.Series:
+        return self._selected(pl.nth(_place(self.file, name, self.names))).to_series()
 
-    def _selected(self, *columns: pl.Expr, then: Sequence[pl.Expr | cs.Selector] = ()) -> pl.DataFrame:
+    def _selected(self, *columns: pl.Expr) -> pl.DataFrame:
         with readable(self.file):
-            chosen = self.frame.select(columns)
-            return (chosen.select(*then) if then else chosen).collect()
+            return self.frame.select(columns).collect()
 
 
 def read_cells(
@@ -247,11 +229,11 @@ def read_cells(
     header_lines = sum(int(number < lines[0] + header_lines) for number in lines[:header_lines])
     if separator == AUTO:
         separator = next((sign for sign in ";\t," if head and sign in head[: max(header_lines, 1)][-1]), ",")
-    separator = separator or "\t"
-    first = list(csv.reader(head, delimiter=separator, skipinitialspace=True))
+    text = _Text(file, source, separator or "\t", lines, decimal_comma)
+    first = list(csv.reader(head, delimiter=text.separator, skipinitialspace=True))
+    if header_lines > len(first):
+        raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
     if header_lines:
-        if len(first) < header_lines:
-            raise DataError(f"{file}: it has no header with the names of its columns; repair it, or take it out")
         names = tuple(name.strip() for name in first[header_lines - 1])
         names = (names[0].lstrip("# "), *names[1:])  # as numpy.savetxt writes it
     else:
@@ -263,37 +245,84 @@ def read_cells(
     skipped = header_lines + bool(units)
     if len(first) <= skipped:
         raise NoRowsError(f"{file}: it has no rows")
+    begun = next((row for row, cells in enumerate(first) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
+    above = int(lines[begun]) - 1 if begun > skipped else 0
     if len(first[skipped]) != len(names):
-        begun = next((row for row, cells in enumerate(first) if 2 * sum(map(_is_float, cells)) >= len(cells) > 1), 0)
-        above = int(lines[begun]) - 1
-        way = f"; are there {above} lines above the rows? --set header_lines={above}"
-        error = _ragged(file, first[skipped], names, 0, int(lines[skipped]))
-        raise DataError(f"{error}{way if begun > skipped else ''}")
+        way = f"; are there {above} lines above the rows? --set header_lines={above}" if above else ""
+        raise DataError(f"{text.ragged(first[skipped], names, skipped, 0)}{way}")
     # Columns that hold numbers in the first rows are read as numbers.
     whole = [row for row in first[skipped:] if len(row) == len(names)]
-    numbers = [
+    numeric = [
         any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells) for cells in zip(*whole, strict=True)
     ]
     scratch = temporary_file(".parquet") if file.stat().st_size > LARGE else None
-    read = partial(_rows, file, source, separator, skipped, numbers, lines[skipped:], decimal_comma, scratch)
-    return Table(file, names, read, lines[skipped:], units, bool(header_lines))
+    return Table(
+        file, names, lambda: text.rows(skipped, numeric, scratch), lines[skipped:], units, bool(header_lines), above
+    )
 
 
-def _source_of(file: Path, separator: str | None) -> tuple[Source, list[str], Lines]:
+@dataclass(frozen=True, eq=False)
+class _Text:
+    """A delimited text. source: what polars reads, a file, a text in memory or a temporary file. lines: its lines."""
+
+    file: Path
+    source: Path | bytes | Any
+    separator: str
+    lines: Lines
+    decimal_comma: bool
+
+    def rows(self, skipped: int, numeric: Sequence[bool], scratch: Any) -> pl.LazyFrame:
+        """The rows below some skipped ones, in memory or in the file ``scratch``.
+
+        numeric: which columns hold numbers; where they hold a text further down, all are read as texts. DataError: the
+        text cannot be read, or a row has too many fields.
+        """
+        text = self.source if isinstance(self.source, Path | bytes) else Path(self.source.name)
+        reason: Exception | None = None
+        for numbers in (numeric, [False] * len(numeric)):
+            schema = {str(place): pl.Float64 if number else pl.String for place, number in enumerate(numbers)}
+            try:
+                frame = pl.scan_csv(
+                    text, has_header=False, separator=self.separator, skip_lines=skipped, schema=schema, glob=False
+                )
+                if self.decimal_comma:
+                    frame = frame.with_columns(pl.col(pl.String).str.replace(",", ".", literal=True))
+                if scratch is None:
+                    return frame.collect().lazy()
+                frame.sink_parquet(scratch.name, compression="lz4", row_group_size=_ROW_GROUP)
+                return pl.scan_parquet(scratch.name, glob=False)
+            except (pl.exceptions.PolarsError, OSError) as error:
+                reason = error
+        opened = BytesIO(text) if isinstance(text, bytes) else text.open("rb")
+        try:
+            with TextIOWrapper(opened, encoding="utf-8-sig") as decoded:
+                rows = csv.reader(islice(decoded, skipped, None), delimiter=self.separator)
+                for row, fields in enumerate(rows):
+                    if fields and len(fields) != len(numeric):
+                        raise self.ragged(fields, numeric, skipped, row)
+        except UnicodeDecodeError:
+            read_text(self.file)  # which says that it is no text
+        raise DataError(f"{self.file}: cannot be read: {reason}")
+
+    def ragged(self, fields: Sequence[str], names: Sequence[object], skipped: int, row: int) -> DataError:
+        """The error of a row with more fields, or fewer, than there are names."""
+        commas = _COMMAS if len(fields) > len(names) else ""
+        what = f"it has {len(fields)} fields, expected {len(names)}; repair the row{commas}"
+        return row_error(self.file, row, int(self.lines[skipped + row]), what)
+
+
+def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, list[str], Lines]:
     """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
     check_file(file, _MOST_BYTES, text=True)
     try:
         with file.open(encoding="utf-8-sig", newline="") as opened:
             head = opened.read(_HEAD)
-    except UnicodeDecodeError:
-        head = read_text(file)[:_HEAD]  # which says that it is no text
-    blank = re.search(r"(?:^|\n)[ \t,;]*\r?\n", head) is not None
-    if separator is not None and not blank and ', "' not in head and "\r" not in head.replace("\r\n", ""):
-        shown = head.splitlines()
-        return file, shown if len(head) < _HEAD else shown[:-1], range(1, _MOST_BYTES)
-    large = file.stat().st_size > LARGE
-    cleaned, numbers, first = temporary_file(".csv") if large else BytesIO(), array("q"), list[str]()
-    try:
+        blank = re.search(r"(?:^|\n)[ \t,;]*\r?\n", head) is not None
+        if separator is not None and not blank and ', "' not in head and "\r" not in head.replace("\r\n", ""):
+            shown = head.splitlines()
+            return file, shown if len(head) < _HEAD else shown[:-1], range(1, _MOST_BYTES)
+        large = file.stat().st_size > LARGE
+        cleaned, numbers, first = temporary_file(".csv") if large else BytesIO(), array("q"), list[str]()
         with file.open(encoding="utf-8-sig") as opened:
             for number, line in enumerate(opened, 1):
                 line = line.rstrip("\n").replace(', "', ',"')
@@ -306,58 +335,7 @@ def _source_of(file: Path, separator: str | None) -> tuple[Source, list[str], Li
         read_text(file)  # which says that it is no text
         raise
     cleaned.flush()
-    return cleaned, first, np.array(numbers)
-
-
-def _rows(
-    file: Path,
-    source: Source,
-    separator: str,
-    skipped: int,
-    numbers: Sequence[bool],
-    lines: Lines,
-    decimal_comma: bool,
-    scratch: Any,
-) -> pl.LazyFrame:
-    """The rows of a text below its header, in memory or in the file ``scratch``.
-
-    numbers: which columns hold numbers; where they hold a text further down, all are read as texts. DataError: the text
-    cannot be read, or a row has too many fields.
-    """
-    text = source if isinstance(source, Path | BytesIO) else Path(source.name)
-    reason: Exception | None = None
-    for numeric in (numbers, [False] * len(numbers)):
-        schema = {str(place): pl.Float64 if number else pl.String for place, number in enumerate(numeric)}
-        try:
-            if isinstance(text, BytesIO):
-                text.seek(0)
-            frame = pl.scan_csv(
-                text, has_header=False, separator=separator, skip_lines=skipped, schema=schema, glob=False
-            )
-            if decimal_comma:
-                frame = frame.with_columns(pl.col(pl.String).str.replace(",", ".", literal=True))
-            if scratch is None:
-                return frame.collect().lazy()
-            frame.sink_parquet(scratch.name, compression="lz4", row_group_size=_ROW_GROUP)
-            return pl.scan_parquet(scratch.name, glob=False)
-        except (pl.exceptions.PolarsError, OSError) as error:
-            reason = error
-    opened = TextIOWrapper(text, encoding="utf-8") if isinstance(text, BytesIO) else text.open(encoding="utf-8-sig")
-    try:
-        with opened:
-            opened.seek(0)
-            rows = csv.reader(islice(opened, skipped, None), delimiter=separator)
-            for row, fields in enumerate(rows):
-                if fields and len(fields) != len(numbers):
-                    raise _ragged(file, fields, numbers, row, int(lines[row]))
-    except UnicodeDecodeError:
-        read_text(file)  # which says that it is no text
-    raise DataError(f"{file}: cannot be read: {reason}")
-
-
-def _ragged(file: Path, fields: Sequence[str], names: Sequence[object], row: int, line: int) -> DataError:
-    what = f"it has {len(fields)} fields, expected {len(names)}; repair the row"
-    return row_error(file, row, line, what + (_COMMAS if len(fields) > len(names) else ""))
+    return cleaned if large else cleaned.getvalue(), first, np.array(numbers)
 
 
 def _are_units(cells: Sequence[str], following: Sequence[str]) -> bool:
@@ -435,9 +413,7 @@ def _place(file: Path, name: str, names: Sequence[str]) -> int:
     if count == 0:
         raise missing_column(file, name, names)
     if count > 1:
-        raise ColumnError(
-            f"{file}: column {name!r} is there {count} times; name each column once, or give its number, from 1"
-        )
+        raise ColumnError(f"{file}: column {name!r} is there {count} times; name each once, or give its number, from 1")
     return names.index(name)
 
 

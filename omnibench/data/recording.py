@@ -32,18 +32,15 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 TimeUnit = Literal["s", "ms", "us", "ns"]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 HeadingUnit = Literal["rad", "deg"]
-RADIANS = {"rad": 1.0, "deg": math.pi / 180}
+RADIANS = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "ticks": 2 * math.pi, "rpm": 2 * math.pi / 60}
 Position = Literal["rad", "deg", "rev", "ticks"]
 WheelPosition = Literal[Position, "m", "mm", "inch"]
 WheelRate = Literal["rad/s", "deg/s", "rev/s", "rpm", "ticks/s", "m/s", "mm/s", "inch/s"]
-WheelIncrement = Literal[
-    "rad/sample", "deg/sample", "rev/sample", "ticks/sample", "m/sample", "mm/sample", "inch/sample"
-]
-WheelUnit = Literal[WheelPosition, WheelRate, WheelIncrement]
+WheelStep = Literal["rad/sample", "deg/sample", "rev/sample", "ticks/sample", "m/sample", "mm/sample", "inch/sample"]
+WheelUnit = Literal[WheelPosition, WheelRate, WheelStep]
 Quantity = Literal["positions", "rates", "increments"]
 TURNS = {"rad": 2 * math.pi, "deg": 360.0, "rev": 1.0}
 """Positions in a turn."""
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi, "ticks": 2 * math.pi, "rpm": 2 * math.pi / 60}
 _POWER = re.compile(r"2\s*(?:\^|\*\*)\s*(\d{1,2})")
 _WRAPS = ("auto", "never")
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
@@ -134,7 +131,7 @@ class RunAttributes:
     split: Split | None = None
     session: str | None = None
     started_at: float | None = None
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, float | None] = field(default_factory=dict)
     sent: Array | None = None
 
 
@@ -245,21 +242,18 @@ Offsets = Annotated[tuple[FiniteFloat, ...], BeforeValidator(_listed)]
 Wrap = Annotated[float | Literal["auto", "never"], BeforeValidator(_as_wrap)]
 
 
+Drift = Annotated[float, Field(gt=-_LARGEST_DRIFT, lt=_LARGEST_DRIFT)]
+Jumps = Literal["keep", "drop", "cut"]
+
+
 class RunsOptions(Options):
     """The robot, which runs train and validate, and what the data set says of itself."""
 
     group: ClassVar[str] = "Robot and runs"
 
-    robot: RobotOption = Field(
-        description="name and wheels: --set robot=FILE.yaml, or robot.yaml in the source or beside it; "
-        "omnibench import csv --template DIR writes one"
-    )
-    wheels: dict[str, dict[str, Any]] = Field(
-        {}, description="values of wheels that replace those of the robot's file, as {left: {y: 0.12}}"
-    )
-    mount: dict[str, float] | None = Field(
-        None, description="the tracked point, in place of the robot's file: {x: 0.1, y: 0} (m) and yaw (rad) or yaw_deg"
-    )
+    robot: RobotOption = Field(description="--set robot=FILE.yaml, or robot.yaml; import csv --template DIR writes one")
+    wheels: dict[str, dict[str, Any]] = Field({}, description="values in place of the file's, as {left: {y: 0.12}}")
+    mount: dict[str, float] | None = Field(None, description="tracked point, {x: 0.1, y: 0} (m), yaw (rad) or yaw_deg")
     train: Names = Field((), description="patterns of run names that train")
     validation: Names = Field((), description="patterns of run names that validate")
     leave_out: Names = Field((), description="patterns of the names of runs that are left out")
@@ -295,11 +289,7 @@ class RecordingOptions(RunsOptions):
 
     group: ClassVar[str] = "Wheels and steering"
 
-    wheel_unit: WheelUnit = Field(
-        "rad/s",
-        description=f"positions {', '.join(get_args(WheelPosition))} (a wheel's travel); rates rad/s, m/s, ..., rpm; "
-        "increments rad/sample, ...",
-    )
+    wheel_unit: WheelUnit = Field("rad/s", description="positions rad, m ...; rates rad/s, rpm ...; or rad/sample ...")
     wheel_signs: Signs = Field((), description="-1 for wheels that count the other way round, as [-1,1]")
     ticks_per_turn: PerWheel = Field((), description="of the wheel, gear included; with gear_ratio of the motor")
     gear_ratio: PerWheel = Field((), description="turns of the motor for one of the wheel, where it has the encoder")
@@ -321,46 +311,29 @@ class ReferenceOptions(RecordingOptions):
 
     position_unit: PositionUnit = Field("m", description="unit of x and y of the poses")
     heading_unit: HeadingUnit = Field("rad", description="unit of the headings of the poses")
-    pose_signs: tuple[Literal[1, -1], ...] = Field(
-        (), description="factors of x, y and heading, each 1 or -1, as [1,-1,-1]"
-    )
+    pose_signs: tuple[Literal[1, -1], ...] = Field((), description="of x, y and heading, each 1 or -1, as [1,-1,-1]")
     heading_offset_deg: FiniteFloat = Field(0.0, description="deg, added to the headings, after the signs")
     pose_time_unit: TimeUnit | None = Field(None, description="default: s, or the wheels' in one table")
     pose_time_offset: FiniteFloat = Field(0.0, description="s, added to the times of the poses")
-    pose_time_drift: Annotated[float, Field(gt=-_LARGEST_DRIFT, lt=_LARGEST_DRIFT)] = Field(
-        0.0, description="s per s since the first pose, added to the times of the poses"
-    )
-    clocks: Literal["same", "match"] = Field(
-        "same", description="match: find offset and drift of each recording from wheels and poses"
-    )
-    longest_gap: Positive | None = Field(
-        None, description="s; a run is cut where wheels or poses are missing for longer; default: as it came"
-    )
-    jumps: Literal["keep", "drop", "cut"] = Field(
-        "keep", description="drop: leave out lone poses that jump; cut: and end a run where the reference goes on apart"
-    )
+    pose_time_drift: Drift = Field(0.0, description="s per s since the first pose, added to the times of the poses")
+    clocks: Literal["same", "match"] = Field("same", description="match: find offsets and drifts from wheels and poses")
+    longest_gap: Positive | None = Field(None, description="s; cut a run where wheels or poses are missing for longer")
+    jumps: Jumps = Field("keep", description="drop lone poses that jump; cut: and end a run where the reference shifts")
     start_at_rest: bool = Field(False, description="true: a run begins where the robot last stood before it drives")
-    cut: Literal["rests", "topic", "windows", "none"] = Field(
-        "none", description="where one run ends and another begins"
-    )
+    cut: Literal["rests", "topic", "windows", "none"] = Field("none", description="where runs end and begin")
     window: Positive | None = Field(None, description="s; cuts each recording into runs this long (cut=windows)")
     least_rest: Positive = Field(0.5, description="s; shorter rests do not cut")
     rest_rate: Positive = Field(0.05, description="rad/s; wheels that turn slower, over least_rest, rest")
     least_run: NonNegative = Field(1.0, description="s; shorter drives between rests are left out")
-    command_pattern: str | None = Field(
-        None, description="regular expression: its group 1 in a run's name is the command; default: by the names"
-    )
+    command_pattern: str | None = Field(None, description="regular expression; group 1 in a run's name: the command")
 
     @model_validator(mode="after")
     def _options_fit_together(self) -> ReferenceOptions:
         self.require_one_each("ticks_per_turn", "gear_ratio", or_one=True)
         self.require_one_each("steering_ticks_per_turn", "steering_scale", "steering_offsets_deg", or_one=True)
         self.require_one_each("wheel_signs", "steering_signs")
-        for unit, key, what in (
-            ("wheel_unit", "ticks_per_turn", "of the wheel, gear included; of the motor with gear_ratio"),
-            ("steering_unit", "steering_ticks_per_turn", "of the steering encoder"),
-        ):
-            value, given = getattr(self, unit), getattr(self, key)
+        for unit, key in (("wheel_unit", "ticks_per_turn"), ("steering_unit", "steering_ticks_per_turn")):
+            value, given, what = getattr(self, unit), getattr(self, key), type(self).model_fields[key].description
             if value.startswith("ticks") and not given:
                 raise ValueError(f"{unit} {value} needs {key} ({what}): --set {key}=N")
             if given and not value.startswith("ticks"):
@@ -399,7 +372,7 @@ class ReferenceOptions(RecordingOptions):
     def wheel_factors(self, unit: str) -> Array:
         """Factors (N,) from a unit to rad, or rad/s, of the wheels in the robot's sense."""
         base = unit.partition("/")[0]
-        radians = METRES[base] / self.robot.radii if base in METRES else np.array(_ANGLES[base])
+        radians = METRES[base] / self.robot.radii if base in METRES else np.array(RADIANS[base])
         factors = radians / np.array(self.ticks_per_turn or 1) / np.array(self.gear_ratio or 1)
         return np.broadcast_to(factors * np.array(self.wheel_signs or 1), len(self.robot.wheel_names))
 

@@ -21,7 +21,6 @@ from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
 from omnibench.data.finding import FindingWarning
-from omnibench.data.jumps import reference_jumps
 from omnibench.data.recording import (
     SECONDS,
     TURNS,
@@ -37,6 +36,7 @@ from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch
 from omnibench.data.splits import complete, divided, every_second, remaining
+from omnibench.data.spoiled_references import reference_jumps
 from omnibench.errors import DataError
 from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array, Robot, fastest_rates, in_the_middle, interpolated

@@ -39,12 +39,19 @@ def divided(
 ) -> list[Trajectory]:
     """The runs with their splits and the number of each repetition; runs that belong to no split are left out.
 
-    train, validation: patterns as for ``split_by_name``, of ``names`` (default: the runs' ids). Without patterns the
-    splits are ``otherwise``; by default every second run of a command validates. ConfigError as for ``split_by_name``.
+    train, validation: shell patterns (``*``, ``?``, ``[ab]``) of ``names`` (default: the runs' ids). Where only one
+    side has patterns, everything else goes to the other; with both, names that match neither are left out. Without
+    patterns the splits are ``otherwise``; by default every second run of a command validates. kind: what the names are,
+    for messages. ConfigError: a pattern matches nothing, or a name matches both sides.
     """
     splits: Sequence[Split | None] = otherwise or every_second([run.command for run in runs])
     if train or validation:
-        splits = split_by_name(names or [run.id for run in runs], train, validation, kind)
+        names = names or [run.id for run in runs]
+        trains, validates = _matching("train", names, train, kind), _matching("validation", names, validation, kind)
+        if both := [name for name in names if name in trains & validates]:
+            raise ConfigError(f"{kind} {both[0]!r} is in both train and validation; name it once")
+        rest: Split | None = "validation" if not validation else "train" if not train else None
+        splits = ["train" if name in trains else "validation" if name in validates else rest for name in names]
     numbers = repetitions([run.command or run.id for run in runs])
     return [
         replace(run, split=split, repetition=number if run.command else None)
@@ -69,21 +76,6 @@ def remaining(names: Sequence[str], patterns: Sequence[str], kind: str) -> set[s
     if not others:
         raise ConfigError(f"leave_out: every {kind} matches {', '.join(patterns)}; keep one at least")
     return others
-
-
-def split_by_name(
-    names: Sequence[str], train: Sequence[str], validation: Sequence[str], kind: str
-) -> list[Split | None]:
-    """The split of each name, by shell patterns (``*``, ``?``, ``[ab]``).
-
-    When only one side has patterns, everything else goes to the other; with both, names that match neither get None.
-    ConfigError: a pattern matches nothing, or a name matches both sides. ``kind`` is what the names are, for messages.
-    """
-    trains, validates = (_matching("train", names, train, kind), _matching("validation", names, validation, kind))
-    if both := [name for name in names if name in trains & validates]:
-        raise ConfigError(f"{kind} {both[0]!r} is in both train and validation; name it once")
-    rest: Split | None = "validation" if not validation else "train" if not train else None
-    return ["train" if name in trains else "validation" if name in validates else rest for name in names]
 
 
 def _matching(option: str, names: Sequence[str], patterns: Sequence[str], kind: str, parts: str = "") -> set[str]:
@@ -132,16 +124,12 @@ def put_together(parts: Sequence[Dataset], places: Sequence[str] | None = None) 
         another = _flat(other.robot.model_dump(exclude={"name"}))
         for key in robot | another:
             if robot.get(key) != another.get(key):
-                raise DataError(
-                    f"data set {place}: its robot is not that of {places[0]} ({key}: {another.get(key)} and "
-                    f"{robot.get(key)}); give both the same robot.yaml (omnibench import dataset FOLDER --set "
-                    "robot=FILE)"
-                )
+                what = f"its robot is not that of {places[0]} ({key}: {another.get(key)} and {robot.get(key)})"
+                way = "give both the same robot.yaml (omnibench import dataset FOLDER --set robot=FILE)"
+                raise DataError(f"data set {place}: {what}; {way}")
         if abs(other.sample_period / first.sample_period - 1) > _SAME_PERIOD:
-            raise DataError(
-                f"data set {place}: its wheels were sampled every {other.sample_period:g} s, those of {places[0]} "
-                f"every {first.sample_period:g} s; take each by itself"
-            )
+            periods = f"every {other.sample_period:g} s, those of {places[0]} every {first.sample_period:g} s"
+            raise DataError(f"data set {place}: its wheels were sampled {periods}; take each by itself")
     runs, names = list[Trajectory](), list[str]()
     for part in parts:
         names.append(part.name if part.name not in names else f"{part.name}-{len(names) + 1}")

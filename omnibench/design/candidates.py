@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,23 +29,9 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.simulate.commands import (
-    LONGEST,
-    SHORTEST,
-    Command,
-    DrivableCommands,
-    MotionGrid,
-    Shapes,
-    SingleCommand,
-    TimedCommand,
-    beyond_steering,
-    default_directions,
-    steering_limit,
-    unsteerable,
-    wheels_of,
-)
-from omnibench.simulate.config import SteeringLimit
-from omnibench.simulate.robot_config import RobotConfig
+from omnibench.simulate import commands as motion
+from omnibench.simulate.commands import Command, TimedCommand
+from omnibench.simulate.config import RobotConfig, SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for, plural
@@ -56,7 +42,7 @@ _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at 
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
-class CommandGrid(MotionGrid):
+class CommandGrid(motion.MotionGrid):
     """A grid of commands: every direction with every turn rate, at each speed."""
 
     distance: Positive | None = Field(None, description="length of each run, m; or give duration")
@@ -82,14 +68,14 @@ class OtherSet(Model):
 
 
 def _kind(block: Any) -> str:
-    keys = set(block) if isinstance(block, Mapping) else set()
-    if isinstance(block, OtherSet) or "set" in keys:
-        return "set"
-    return "command" if isinstance(block, SingleCommand) or keys & {"speed", "direction_deg", "turn_rate"} else "grid"
+    keys = set(block) if isinstance(block, Mapping) else set(type(block).model_fields)
+    return "set" if "set" in keys else "command" if keys & {"speed", "direction_deg", "turn_rate"} else "grid"
 
 
 Block = Annotated[
-    Annotated[CommandGrid, Tag("grid")] | Annotated[SingleCommand, Tag("command")] | Annotated[OtherSet, Tag("set")],
+    Annotated[CommandGrid, Tag("grid")]
+    | Annotated[motion.SingleCommand, Tag("command")]
+    | Annotated[OtherSet, Tag("set")],
     Discriminator(_kind),
 ]
 
@@ -135,9 +121,10 @@ class DesignConfig(Model):
             commands = self.commands(name)
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
-            chosen = [timed.command for timed in commands]
-            if beyond := unsteerable(self.robot, chosen, self.steering_limit_deg):
-                why = beyond_steering(self.robot, beyond, self.steering_limit_deg)
+            limit = motion.steering_limit(self.robot, self.steering_limit_deg)
+            beyond = [each.command for each in commands if not motion.is_within(self.robot, each.command, limit)]
+            if beyond:
+                why = motion.beyond_steering(self.robot, beyond, limit)
                 raise ValueError(f"sets.{name}: {why}; take such commands out")
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
@@ -172,8 +159,77 @@ Per = Literal["run", "second", "metre"]
 """Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
 
 
+@dataclass(frozen=True, eq=False)
+class CandidateRun:
+    """A command that a design may choose, with runs of it: those recorded, or one at the design values."""
+
+    name: str
+    runs: tuple[Trajectory, ...]
+
+    @property
+    def duration(self) -> float:
+        """The mean duration of the command's runs, s."""
+        return float(np.mean([run.pose_times[-1] for run in self.runs]))
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatePool:
+    """Candidates, noise and baseline of a design.
+
+    sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
+    designs are compared with. recorded: the candidates' wheel logs are recordings; else rates are as designed.
+    """
+
+    source: str
+    name: str
+    robot: Robot
+    integration: Integration
+    baseline_name: str
+    noise: Noise
+    noise_source: str
+    description: str = ""
+    notes: tuple[str, ...] = ()
+    candidates: tuple[CandidateRun, ...] = ()
+    sets: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    baseline: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    simulated: bool = True
+    recorded: bool = False
+
+    def commanded(
+        self,
+        periods: tuple[float, float],
+        sets: Mapping[str, Sequence[TimedCommand]],
+        driven: Mapping[TimedCommand, int],
+    ) -> CandidatePool:
+        """The pool with candidates of sets of commands, each with the one run of a robot that is exactly as designed.
+
+        periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
+        ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
+        """
+        place = self.source
+        if _noiseless(self.noise):
+            raise ConfigError(f"{place}: noise: give position and heading some; without it, runs cannot be weighed")
+        commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
+        places = {timed: index for index, timed in enumerate(commands)}
+        model = OdometryModel.of_design(self.robot, self.integration)
+        names = Counter(timed.command.name for timed in commands)
+        candidates = []
+        for timed in commands:
+            title = timed.command.name
+            title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
+            candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
+        indices = {of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()}
+        for of_set, chosen in indices.items():
+            if len(chosen) == 1:
+                raise ConfigError(f"{place}: {of_set}: it has one command only; a design needs several to choose from")
+            runs = [run for index in chosen for run in candidates[index].runs]
+            require_every_motion(self.robot, runs, f"{place}: {of_set}", ConfigError)
+        baseline = np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp)
+        return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
+
+
 # What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
-_SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
+_SHAPES = motion.Shapes((0.5, 1.0), (0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
 _MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"
@@ -211,30 +267,29 @@ def design_source(
     with the other, or a value that cannot be.
     """
     given = {name: value for name, value in vars(options).items() if value is not None}
+    for name, value in given.items():
+        option = f"--{name.replace('_', '-')}"
+        if robot is None:
+            raise ConfigError(f"{option}: is for --robot FILE, a design without a recording")
+        if name != "area" and not 0 < value < _MOST.get(name, math.inf):
+            below = f" and below {_MOST[name]:g}" if name in _MOST else ""
+            raise ConfigError(f"{option} {value:g}: must be above 0{below}")
     if robot is None:
-        for name in given:
-            raise ConfigError(f"--{name.replace('_', '-')}: is for --robot FILE, a design without a recording")
         if source is None:
             raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
         return source
     if source is not None:
         raise ConfigError(f"--robot {robot}: designs without {source}; give one of them")
     refuse_choice(dataset, robot)
-    for name, value in given.items():
-        if name != "area" and not 0 < value < _MOST.get(name, math.inf):
-            below = f" and below {_MOST[name]:g}" if name in _MOST else ""
-            raise ConfigError(f"--{name.replace('_', '-')} {value:g}: must be above 0{below}")
     noise = ASSUMED_NOISE.model_dump()
     noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
     noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
     if "area" in given:
-        # The sides, m, of an area like 3x2.5
-        text = given["area"]
+        text = given["area"]  # the sides, m, like 3x2.5
         match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
-        sides = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
+        given["area"] = sides = tuple(map(float, match.groups())) if match else (0.0, 0.0)
         if min(sides) <= 0 or not math.isfinite(max(sides)):
             raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
-        given["area"] = sides
     if "steering_limit" in given:
         given["steering_limit_deg"] = given.pop("steering_limit")
     content = {"robot": str(robot), "noise": noise, **given}
@@ -265,8 +320,8 @@ class RobotCommands(Model):
                 f"--max-speed {self.max_speed:g}: at --max-wheel-rate {self._wheel_rate:g} rad/s the wheels drive at "
                 f"most {math.floor(1000 * fastest) / 1000:g} m/s; give no more, or raise the wheels' rate"
             )
-        if min(self._free) < 2 * SHORTEST:
-            need = 2 * (self._half_width + SHORTEST)
+        if min(self._free) < 2 * motion.SHORTEST:
+            need = 2 * (self._half_width + motion.SHORTEST)
             raise ValueError(
                 f"--area {self.area[0]:g}x{self.area[1]:g}: the robot alone takes {2 * self._half_width:.2g} m; give "
                 f"both sides at least {math.ceil(10 * need) / 10:g} m"
@@ -279,27 +334,25 @@ class RobotCommands(Model):
         source: for messages. ConfigError: the commands leave part of the matrix undetermined.
         """
         # Lines, arcs to both sides and turns on the spot, each as fast as the limits allow.
-        robot, limit, free = self.robot, self._steering_limit, self._free
-        drivable = DrivableCommands(robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, free, _SHAPES)
+        robot, limit, noise = self.robot, motion.steering_limit(self.robot, self.steering_limit_deg), self.noise
+        drivable = motion.DrivableCommands(
+            robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, self._free, _SHAPES
+        )
         commands = tuple(dict.fromkeys(drivable))
+        floor = f"{self.area[0]:g} x {self.area[1]:g} m"
         if not any(timed.command.turn_rate for timed in commands):
             raise ConfigError(
-                f"{source}: no curve that it can drive within {LONGEST:g} s fits an area of {self.area[0]:g} x "
-                f"{self.area[1]:g} m; give a larger --area, or a greater --steering-limit or --max-speed"
+                f"{source}: no curve that it can drive within {motion.LONGEST:g} s fits an area of {floor}; give a "
+                "larger --area, or a greater --steering-limit or --max-speed"
             )
-        noise = self.noise
-        # The limits in words
         words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
-        if not self.robot.drive.direct:
-            words.append(f"steering angles {math.degrees(self._steering_limit):g} deg")
-        return commanded_pool(
+        if not robot.drive.direct:
+            words.append(f"steering angles {math.degrees(limit):g} deg")
+        pool = CandidatePool(
             source,
             robot.name or "robot",
             robot,
             integration,
-            (_SAMPLE_PERIOD, _POSE_PERIOD),
-            {_SET: commands},
-            driven=dict.fromkeys(commands, 1),
             baseline_name=f"all {plural(len(commands), 'command')} once",
             noise=noise,
             noise_source=(
@@ -309,25 +362,23 @@ class RobotCommands(Model):
             ),
             description="What to drive before anything was recorded.",
             notes=(
-                f"Commands were made for at most {', '.join(words)}, and a free floor of {self.area[0]:g} x "
-                f"{self.area[1]:g} m, of which the robot's wheels need {self._half_width:.2g} m about its centre.",
+                f"Commands were made for at most {', '.join(words)}, and a free floor of {floor}, of which the robot's "
+                f"wheels need {self._half_width:.2g} m about its centre.",
                 "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
             ),
         )
+        return pool.commanded((_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands}, dict.fromkeys(commands, 1))
 
     @property
     def _straight_rates(self) -> list[float]:
         """Largest wheel rates, rad/s, straight on at the greatest speed, in each direction that the robot drives."""
-        twists = [Command(self.max_speed, math.radians(each), 0.0).twist for each in default_directions(self.robot)]
-        return [float(np.abs(wheels_of(self.robot, twist)[0]).max()) for twist in twists]
+        directions = map(math.radians, motion.default_directions(self.robot))
+        twists = [Command(self.max_speed, direction, 0.0).twist for direction in directions]
+        return [float(np.abs(motion.wheels_of(self.robot, twist)[0]).max()) for twist in twists]
 
     @property
     def _wheel_rate(self) -> float:
         return self.max_wheel_rate or max(self._straight_rates)
-
-    @property
-    def _steering_limit(self) -> float:
-        return steering_limit(self.robot, self.steering_limit_deg)
 
     @property
     def _half_width(self) -> float:
@@ -339,51 +390,6 @@ class RobotCommands(Model):
         """Sides, m, of the area that the robot's centre may be in."""
         wide, deep = (side - 2 * self._half_width for side in self.area)
         return wide, deep
-
-
-@dataclass(frozen=True, eq=False)
-class CandidateRun:
-    """A command that a design may choose, with runs of it: those recorded, or one at the design values."""
-
-    name: str
-    runs: tuple[Trajectory, ...]
-
-    @property
-    def duration(self) -> float:
-        """The mean duration of the command's runs, s."""
-        return float(np.mean([run.pose_times[-1] for run in self.runs]))
-
-    @property
-    def distance(self) -> float:
-        """The distance that the robot's centre drives, m: as commanded, or else along the reference poses."""
-        given = self.runs[0].distance
-        if given is not None:
-            return float(given)
-        return float(np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in self.runs]))
-
-
-@dataclass(frozen=True, eq=False)
-class CandidatePool:
-    """Candidates, noise and baseline of a design.
-
-    sets: indices of the candidates of each set. baseline (C,): how often each is driven in the experiment that
-    designs are compared with. recorded: the candidates' wheel logs are recordings; else rates are as designed.
-    """
-
-    source: str
-    name: str
-    description: str
-    robot: Robot
-    integration: Integration
-    candidates: tuple[CandidateRun, ...]
-    sets: Mapping[str, tuple[int, ...]]
-    baseline: Counts
-    baseline_name: str
-    noise: Noise
-    noise_source: str
-    simulated: bool
-    recorded: bool
-    notes: tuple[str, ...]
 
 
 def read_candidates(
@@ -468,20 +474,19 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
     """
     commands = {name: config.commands(name) for name in config.sets}
     baseline, count = config.baseline, len(commands[config.baseline.set])
-    return commanded_pool(
+    pool = CandidatePool(
         source or f"config {config.name}",
         config.name,
         config.robot,
         config.integration,
-        (config.sample_period, config.pose_period),
-        commands,
-        driven=dict.fromkeys(commands[baseline.set], baseline.repetitions),
         baseline_name=f"{count} {noun_for(count, 'command')} of {baseline.set} x {baseline.repetitions}",
         noise=config.noise,
         noise_source="assumed: as the config says",
         description=config.description,
         notes=config.notes,
     )
+    driven = dict.fromkeys(commands[baseline.set], baseline.repetitions)
+    return pool.commanded((config.sample_period, config.pose_period), commands, driven)
 
 
 def _candidates_of_comparison(
@@ -492,93 +497,33 @@ def _candidates_of_comparison(
     if name is None and len(config.datasets) > 1:
         raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
     name = name or next(iter(config.datasets))
-    source = config.datasets[name]
-    chosen = integration or config.integration
-    if isinstance(source.simulate, RobotConfig):
+    source, chosen = config.datasets[name], integration or config.integration
+    flower = source.simulate
+    if isinstance(flower, RobotConfig):
         raise ConfigError(
             f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; make it with "
             "`omnibench simulate`, and design from its folder"
         )
-    if source.simulate is None:
+    if flower is None:
         return candidates_of_dataset(source.load(name), chosen, f"{place}: data set {name}")
     # The commands that the training session of a simulated data set drives, with the noise that is simulated
-    flower = source.simulate
     driven = Counter[TimedCommand]()
-    for each in flower.planned(flower.train):
-        driven[each.timed] += each.repetitions
-    often = (
-        f" x {driven.total() // len(driven)}"
-        if len(set(driven.values())) == 1
-        else f", {plural(driven.total(), 'run')}"
-    )
+    for planned in flower.planned(flower.train):
+        driven[planned.timed] += planned.repetitions
+    times = {*driven.values()}
+    often = f" x {times.pop()}" if len(times) == 1 else f", {plural(driven.total(), 'run')}"
     scale = flower.train.noise_scale
-    return commanded_pool(
+    pool = CandidatePool(
         place,
         name,
         flower.robot,
         chosen,
-        (flower.sample_period, flower.pose_period),
-        {name: tuple(driven)},
-        driven=driven,
         baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {name}{often}",
         noise=Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
         noise_source="assumed: what the config simulates for training",
         notes=config.notes,
     )
-
-
-def commanded_pool(
-    source: str,
-    name: str,
-    robot: Robot,
-    integration: Integration,
-    periods: tuple[float, float],
-    sets: Mapping[str, Sequence[TimedCommand]],
-    *,
-    driven: Mapping[TimedCommand, int],
-    baseline_name: str,
-    noise: Noise,
-    noise_source: str,
-    description: str = "",
-    notes: tuple[str, ...] = (),
-) -> CandidatePool:
-    """The candidates of sets of commands, each with the one run of a robot that is exactly as designed.
-
-    periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
-    ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
-    """
-    if _noiseless(noise):
-        raise ConfigError(f"{source}: noise: give position and heading some noise; without it, runs cannot be weighed")
-    commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
-    places = {timed: index for index, timed in enumerate(commands)}
-    model = OdometryModel.of_design(robot, integration)
-    names = Counter(timed.command.name for timed in commands)
-    candidates = {}
-    for timed in commands:
-        title = timed.command.name
-        title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
-        candidates[timed] = CandidateRun(title, (run_as_designed(model, timed, periods, title),))
-    for of_set, listed in sets.items():
-        if len(listed) == 1:
-            raise ConfigError(f"{source}: {of_set}: it has one command only; a design needs several to choose from")
-        runs = [run for timed in listed for run in candidates[timed].runs]
-        require_every_motion(robot, runs, f"{source}: {of_set}", ConfigError)
-    return CandidatePool(
-        source=source,
-        name=name,
-        description=description,
-        robot=robot,
-        integration=integration,
-        candidates=tuple(candidates.values()),
-        sets={of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()},
-        baseline=np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp),
-        baseline_name=baseline_name,
-        noise=noise,
-        noise_source=noise_source,
-        simulated=True,
-        recorded=False,
-        notes=notes,
-    )
+    return pool.commanded((flower.sample_period, flower.pose_period), {name: tuple(driven)}, driven)
 
 
 def _noiseless(noise: Noise) -> bool:

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array
-from omnibench.words import plural
 
 Counts = NDArray[np.intp]
 
@@ -192,15 +191,10 @@ def _shares_about(shares: Array, draws: int) -> Iterator[Array]:
 def rounded(candidates: Candidates, shares: Array, runs: int, enough: float = math.inf) -> Counts:
     """A design of ``runs`` runs near the shares (C,) of a continuous one: counts (C,).
 
-    The shares become whole runs by the largest remainders, then runs are exchanged. ValueError when the candidates may
-    not be driven that often.
+    The shares become whole runs by the largest remainders, then runs are exchanged. The candidates may be driven that
+    often.
     """
     limit = runs if candidates.most is None else candidates.most
-    if limit * len(candidates) < runs:
-        raise ValueError(
-            f"{plural(len(candidates), 'candidate')}, each driven at most {plural(limit, 'time')}, cannot make "
-            f"{plural(runs, 'run')}"
-        )
     wanted = shares / candidates.costs
     wanted = runs * wanted / wanted.sum()
     counts: Counts = np.minimum(np.floor(wanted + _ROUNDING).astype(np.intp), limit)

@@ -184,11 +184,12 @@ class DesignProblem:
     def __init__(self, pool: CandidatePool, use: Use, per: Per, repetitions: int | None) -> None:
         self.pool, self.use, self.per, self.repetitions = pool, use, per, repetitions
         self.described = tuple(_described(candidate, pool.robot) for candidate in pool.candidates)
-        self.costs = np.array([_cost(candidate, per) for candidate in self.described])
+        costs = ({"run": 1.0, "second": each.duration_s, "metre": each.rolled_m}[per] for each in self.described)
+        self.costs = np.array([*costs])
         directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
         self.information = {name: self._information(name) for name in USES}
-        self._everything: dict[Use, d_optimality.Candidates] = {}
+        self._candidates: dict[tuple[Use, str | None], d_optimality.Candidates] = {}
         # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
         self._physical: Array | None = None
         geometry = WheelGeometry(pool.robot)
@@ -207,18 +208,17 @@ class DesignProblem:
         ]
         return self.basis.T @ np.array(means) @ self.basis
 
-    def everything(self, use: Use) -> d_optimality.Candidates:
-        """All candidates, as a common measure for designs from different sets."""
-        if use not in self._everything:
-            self._everything[use] = self.candidates(use)
-        return self._everything[use]
-
     def candidates(self, use: Use, name: str | None = None) -> d_optimality.Candidates:
-        """The candidates of a set, or all. ConfigError when they leave part of the matrix undetermined."""
+        """The candidates of a set, or all, which are a common measure for designs from different sets.
+
+        ConfigError when they leave part of the matrix undetermined.
+        """
+        if (use, name) in self._candidates:
+            return self._candidates[use, name]
         chosen = list(range(len(self.described)) if name is None else self.pool.sets[name])
         information = self.information[use][chosen]
         try:
-            return d_optimality.Candidates(information, self.costs[chosen], self.repetitions)
+            self._candidates[use, name] = d_optimality.Candidates(information, self.costs[chosen], self.repetitions)
         except ValueError:
             mean = information.mean(axis=0)
             scale = d_optimality.scale_of(mean)
@@ -231,6 +231,7 @@ class DesignProblem:
                 f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined "
                 f"along {direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
             ) from None
+        return self._candidates[use, name]
 
     def of_all(self, name: str, counts: d_optimality.Counts) -> d_optimality.Counts:
         """Counts of a set's candidates as counts (C,) of all."""
@@ -245,7 +246,7 @@ class DesignProblem:
 
     def precision(self, counts: d_optimality.Counts) -> Precision:
         """Standard deviations that ``counts`` runs (C,) of the candidates give."""
-        everything = self.everything(self.use)
+        everything = self.candidates(self.use)
         covariance = self.basis @ everything.covariance(counts) @ self.basis.T
         deviations = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(3, -1)
         largest = self.pool.robot.row_scales
@@ -262,7 +263,7 @@ class DesignProblem:
 
     def step(self, counts: d_optimality.Counts, bound: float) -> Step:
         """The precision of ``counts`` (C,), with its efficiency as a share of ``bound``."""
-        efficiency = self.everything(self.use).criterion(counts) / bound
+        efficiency = self.candidates(self.use).criterion(counts) / bound
         return Step(**dict(self.precision(counts)), efficiency=efficiency)
 
     def chosen(self, counts: d_optimality.Counts) -> tuple[Chosen, ...]:
@@ -292,18 +293,20 @@ def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
     path = np.round(relative(first.start, first.poses[picks]), 5)
     known = first.v is not None and first.alpha is not None and first.omega is not None
-    radii = robot.radii
+    radii, runs = robot.radii, candidate.runs
     rolled = [
-        float((np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None] * radii).sum() / len(radii))
-        for run in candidate.runs
+        float((np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None] * radii).sum() / len(radii)) for run in runs
     ]
+    distance = first.distance  # as commanded, or else along the reference poses
+    if distance is None:
+        distance = np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in runs])
     return Candidate(
         name=candidate.name,
         speed=first.v if known else None,
         direction=first.alpha if known else None,
         turn_rate=first.omega if known else None,
         duration_s=candidate.duration,
-        distance_m=candidate.distance,
+        distance_m=float(distance),
         rolled_m=float(np.mean(rolled)),
         path=tuple((px, py, ph) for px, py, ph in path.tolist()),
     )
@@ -317,10 +320,6 @@ def _motion_precisions(robot: Robot, covariance: Array) -> Iterator[MotionPrecis
         along = np.kron(np.eye(3), length * robot.signal_equations @ motion)
         x, y, heading = np.sqrt(np.maximum(np.diagonal(along @ covariance @ along.T), 0.0)).tolist()
         yield MotionPrecision(motion=name, position_mm=1000 * math.hypot(x, y), heading_deg=math.degrees(heading))
-
-
-def _cost(candidate: Candidate, per: Per) -> float:
-    return {"run": 1.0, "second": candidate.duration_s, "metre": candidate.rolled_m}[per]
 
 
 def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> PhysicalSpread:
@@ -409,6 +408,7 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
     chosen = _wanted(steps, runs, f"{problem.pool.source}: {name}")
     commands = [problem.described[index].name for index in problem.pool.sets[name]]
     shares = zip(commands, optimum.shares.tolist(), strict=True)
+    made = {problem.use: (optimum, designs)}
     return SetDesign(
         name=name,
         commands=tuple(commands),
@@ -420,12 +420,9 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
         chosen=problem.chosen(designs[chosen]),
         step=steps[chosen],
         reached=steps[chosen].efficiency >= GOOD_EFFICIENCY,
-        baseline_efficiency=problem.everything(problem.use).criterion(baseline) / optimum.bound,
+        baseline_efficiency=problem.candidates(problem.use).criterion(baseline) / optimum.bound,
         steps=tuple(steps),
-        equivalents=tuple(
-            _equal(problem, name, use, optimum, designs) if use == problem.use else _equal_otherwise(problem, name, use)
-            for use in USES
-        ),
+        equivalents=tuple(_equal(problem, name, use, *made.get(use, ())) for use in USES),
     )
 
 
@@ -444,27 +441,24 @@ def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
     raise ConfigError(f"{place}: {plural(runs, 'run')} cannot be chosen so that they identify the matrix; {span}")
 
 
-def _equal_otherwise(problem: DesignProblem, name: str, use: Use) -> Equivalent:
-    """The equivalent for the use that the design is not made for, which may leave part of the matrix undetermined."""
-    try:
-        optimum = d_optimality.continuous_optimum(problem.candidates(use, name))
-    except ConfigError:
-        return Equivalent(use=use, effort=None, least=None, chosen=())
-    return _equal(problem, name, use, optimum)
-
-
 def _equal(
     problem: DesignProblem,
     name: str,
     use: Use,
-    optimum: d_optimality.ContinuousDesign,
+    optimum: d_optimality.ContinuousDesign | None = None,
     designs: Sequence[d_optimality.Counts] = (),
 ) -> Equivalent:
     """The smallest design for a use that tells as much about the matrix as the baseline.
 
-    designs: made already, from the smallest on; the first that tells as much is taken; if none does, one is made.
+    optimum, designs: made already for this use, designs from the smallest on; the first that tells as much is taken; if
+    none does, one is made. A use for which none are made may leave part of the matrix undetermined.
     """
-    everything = problem.everything(use)
+    if optimum is None:
+        try:
+            optimum = d_optimality.continuous_optimum(problem.candidates(use, name))
+        except ConfigError:
+            return Equivalent(use=use, effort=None, least=None, chosen=())
+    everything = problem.candidates(use)
     target = everything.root(problem.pool.baseline)
     counts = next((design for design in designs if everything.root(design) >= target), None)
     if counts is None:

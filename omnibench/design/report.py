@@ -27,7 +27,7 @@ from omnibench.report.numbers import (
 )
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
 from omnibench.robot.kinematics import Array
-from omnibench.words import noun_for, plural
+from omnibench.words import plural
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
 UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}
@@ -63,9 +63,8 @@ def _way_in_words(direction: float) -> str:
 
 def plan_in_words(design: Design, of_set: SetDesign) -> tuple[str, ...]:
     """What to drive of a set, a line for each chosen command, with how often."""
-    return tuple(
-        f"{drive_in_words(design.candidate(chosen.command))}, {plural(chosen.runs, 'time')}" for chosen in of_set.chosen
-    )
+    drives = ((drive_in_words(design.candidate(chosen.command)), chosen.runs) for chosen in of_set.chosen)
+    return tuple(f"{drive}, {plural(runs, 'time')}" for drive, runs in drives)
 
 
 def motions_in_words(of_set: SetDesign) -> str:
@@ -90,10 +89,9 @@ def effort_in_words(effort: Effort) -> str:
 
 def origin_in_words(design: Design) -> str:
     """Origin of candidates and noise, so that nobody takes an assumption for a measurement."""
-    if design.recorded:
-        kind = "simulated recordings" if design.simulated else "recordings"
-        return f"candidates: commands of {kind}; noise {design.noise_source}"
-    return f"candidates: commands as designed, nothing recorded; noise {design.noise_source}"
+    recorded = "of simulated recordings" if design.simulated else "of recordings"
+    kind = recorded if design.recorded else "as designed, nothing recorded"
+    return f"candidates: commands {kind}; noise {design.noise_source}"
 
 
 def choice_in_words(design: Design, of_set: SetDesign) -> str:
@@ -114,10 +112,8 @@ def equal_in_words(design: Design, of_set: SetDesign, use: Use) -> str:
     equal = of_set.equivalent(use)
     if equal.least is None:
         return "none: they leave part of the matrix undetermined"
-    least = f"{least_in_words(equal.least)} {UNIT_OF_COST[design.per]}"
-    if equal.effort is None:
-        return f"none within the repetitions allowed (no design does it below {least})"
-    return f"{effort_in_words(equal.effort)} (no design does it below {least})"
+    effort = "none within the repetitions allowed" if equal.effort is None else effort_in_words(equal.effort)
+    return f"{effort} (no design does it below {least_in_words(equal.least)} {UNIT_OF_COST[design.per]})"
 
 
 def headline(design: Design) -> str:
@@ -128,7 +124,7 @@ def headline(design: Design) -> str:
         runs, chosen = plural(of_set.step.effort.runs, "run"), plural(len(of_set.chosen), "command")
         words = f"{drive} {runs} of {chosen}; together they give "
         if of_set.reached:
-            commands = f"{len(of_set.commands)} {noun_for(len(of_set.commands), 'command')}"
+            commands = plural(len(of_set.commands), "command")
             words += f"as much information per {design.per} as the best design from {commands}, within 1 %"
         else:
             words += f"{percent(of_set.step.efficiency)} of the best design's information per {design.per}"
@@ -322,14 +318,17 @@ def _legend(design: Design) -> tuple[page.LegendItem, ...]:
 def _flower(design: Design, of_set: SetDesign) -> go.Figure:
     counts: Mapping[str, int] = {chosen.command: chosen.runs for chosen in of_set.chosen}
     candidates = [design.candidate(name) for name in of_set.commands]
-    reach = max(max(math.hypot(x, y) for x, y, _ in candidate.path) for candidate in candidates) or 1.0
-    spots = [candidate for candidate in candidates if _on_the_spot(candidate)]
-    radii = {spot.name: reach * (0.1 + 0.3 * index / len(spots)) for index, spot in enumerate(spots)}
+    reaches = {each.name: max(math.hypot(x, y) for x, y, _ in each.path) for each in candidates}
+    spots, reach = [name for name, farthest in reaches.items() if farthest < 0.01], max(reaches.values()) or 1.0
     traces = []
     for candidate in sorted(candidates, key=lambda command: (counts.get(command.name, 0) > 0, -_turned(command))):
-        name = candidate.name
-        points = _arc(candidate, radii[name]) if name in radii else np.array(candidate.path)[:, :2]
-        traces += _path(candidate, points, counts.get(name, 0))
+        points = np.array(candidate.path)[:, :2]
+        if candidate.name in spots:  # a turn on the spot is drawn as an arc about the origin of at most 330 deg
+            turned = math.copysign(min(abs(_turned(candidate)), math.radians(330)), _turned(candidate))
+            angles = np.linspace(0.0, turned, 60)
+            radius = reach * (0.1 + 0.3 * spots.index(candidate.name) / len(spots))
+            points = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        traces += _path(candidate, points, counts.get(candidate.name, 0))
     return plan(*traces, marks(ORIGIN, 7, [0], [0], hover="start"))
 
 
@@ -356,18 +355,6 @@ def _turned(candidate: Candidate) -> float:
     return candidate.path[-1][2] - candidate.path[0][2]
 
 
-def _on_the_spot(candidate: Candidate) -> bool:
-    return max(math.hypot(x, y) for x, y, _ in candidate.path) < 0.01
-
-
-def _arc(candidate: Candidate, radius: float) -> Array:
-    """Points (60, 2) of an arc about the origin that stands for a turn on the spot; at most 330 deg."""
-    turned = _turned(candidate)
-    shown = math.copysign(min(abs(turned), math.radians(330)), turned)
-    angles = np.linspace(0.0, shown, 60)
-    return radius * np.column_stack([np.cos(angles), np.sin(angles)])
-
-
 # Designs in the table against the number of runs, beside the chosen one and the baseline. Only the table's length hangs
 # on it: 6 and 15 lines in the place of 9 with half of it and with twice (tests/studies/constants_fit.py).
 _ROWS = 7
@@ -384,17 +371,13 @@ def equal_table(design: Design) -> page.Table:
     rows = []
     for of_set in design.sets:
         for equal in of_set.equivalents:
-            effort = equal.effort
-            reason = (
-                "they leave part of the matrix undetermined"
-                if equal.least is None
-                else "not within the repetitions allowed"
-            )
+            effort, least = equal.effort, NOTHING if equal.least is None else least_in_words(equal.least)
+            left_open = "they leave part of the matrix undetermined"
+            reason = left_open if equal.least is None else "not within the repetitions allowed"
             cells: tuple[page.Cell | str, ...] = (page.Cell(NOTHING, reason), NOTHING, NOTHING)
             if effort is not None:
                 distance = f"{significant(effort.metres, 3)} m"
                 cells = (count(effort.runs), duration_in_words(effort.seconds), distance)
-            least = NOTHING if equal.least is None else least_in_words(equal.least)
             rows.append(page.Row.of(of_set.name, USE_IN_WORDS[equal.use], *cells, least))
     effort = design.baseline.precision.effort
     return page.Table(

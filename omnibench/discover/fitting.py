@@ -28,7 +28,7 @@ from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, sl
 from omnibench.discover.regressors.significance import Group
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.motion_windows import windows_of
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term

@@ -18,7 +18,7 @@ from omnibench.data.stored import drawn_runs
 from omnibench.errors import computable, require_type
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.estimate import estimate, usual_problem
-from omnibench.fit.ratio_intervals import BOOTSTRAPPED, FEWEST, Bootstrap, Interval, RatioIntervals, Units, units_of
+from omnibench.fit.intervals import BOOTSTRAPPED, FEWEST, Bootstrap, Clusters, Interval, RatioIntervals, units_of
 from omnibench.fit.reference_rows import errors_by_kind, mean_errors, measured_parts
 from omnibench.fit.sessions import compare_sessions
 from omnibench.registry import costs
@@ -107,7 +107,7 @@ def judge(
     )
 
 
-def _undecided(gain: Interval | None, units: Units, same: bool) -> str:
+def _undecided(gain: Interval | None, units: Clusters, same: bool) -> str:
     """Why held-out runs leave it undecided whether the calibration is better or worse."""
     if same:
         return "the same as the design"
@@ -120,14 +120,14 @@ def _undecided(gain: Interval | None, units: Units, same: bool) -> str:
     return "undecided: chance alone can explain the difference"
 
 
-def _gain_in_words(gain: Interval | None, units: Units) -> str:
+def _gain_in_words(gain: Interval | None, units: Clusters) -> str:
     """The improvement of Eq. (6) with its interval and what that rests on; empty where there is none."""
     if gain is None:
         return ""
-    basis = units.words
+    basis = units.ratio_words
     if gain.known is not None:
         low, high = sorted(end if gain.value >= 0 else -end for end in gain.known)
-        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.words}"
+        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.ratio_words}"
     direction = "falls" if gain.value >= 0 else "rises"
     return f"the final error, Eq. (6), {direction} by {100 * abs(gain.value):.1f} % ({basis}); "
 

@@ -239,12 +239,6 @@ class ReferenceRows:
         return bool((self.lengths == "distance").any())
 
     @cached_property
-    def begins_at_start(self) -> NDArray[np.bool_]:
-        """True (S, 3) for what is measured in a fixed frame, so that it counts from the run's start."""
-        places = (self.lengths == "pose") | (self.lengths == "position")
-        return np.column_stack([places, places, (self.angles == "pose") | (self.angles == "heading")])
-
-    @cached_property
     def tells_no_heading(self) -> NDArray[np.bool_]:
         """True (S,) for positions of a run that hardly leaves its place, so that they do not tell its start heading.
 

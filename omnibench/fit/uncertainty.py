@@ -1,6 +1,6 @@
 """Uncertainty of a calibration: covariance of the matrix elements, and of the physical parameters that they mean.
 
-It is the calibrator's own, or the jackknife (jackknife.py) of an estimate that minimises a sum of norms p_i |e_i|, or
+It is the calibrator's own, or the jackknife (intervals.py) of an estimate that minimises a sum of norms p_i |e_i|, or
 such a sum under a robust loss. With the direction u_i = e_i / |e_i| of a weighted error and its derivatives J_i by
 the fitted numbers, such a sum has the slope and the Hessian (second derivatives of the poses are neglected)
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import RunResult
 from omnibench.fit.cost import Cost
-from omnibench.fit.jackknife import Clusters, depending, jackknife
+from omnibench.fit.intervals import Clusters, depending, jackknife
 from omnibench.fit.loss import RobustCost, loss_of, norms_of
 from omnibench.fit.noise import GIVEN, roots_of
 from omnibench.fit.open_combinations import elements_open

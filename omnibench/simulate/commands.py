@@ -9,7 +9,6 @@ from itertools import product
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
@@ -46,11 +45,11 @@ class Command:
         return np.array([x + self.turn_rate * self.pivot[1], y - self.turn_rate * self.pivot[0], self.turn_rate])
 
 
-def straight_and_pivot(robot: Robot) -> tuple[float, tuple[float, float]] | None:
-    """The direction, rad, in which a robot rolls that cannot go sideways, and its pivot; None for one that can."""
+def straight_and_pivot(robot: Robot) -> tuple[float | None, tuple[float, float]]:
+    """Direction, rad, in which a robot rolls that cannot go sideways, and its pivot; of others None and the centre."""
     motions = robot.motions
     if len(motions) == 3:
-        return None
+        return None, (0.0, 0.0)
     line, turning = motions
     straight = line / np.hypot(line[0], line[1]) * np.sign(max(line[:2], key=abs))
     turning = turning / turning[2]
@@ -61,17 +60,15 @@ def straight_and_pivot(robot: Robot) -> tuple[float, tuple[float, float]] | None
 
 def default_directions(robot: Robot) -> tuple[float, ...]:
     """Directions, deg, where none are given: every 45 degrees; forward and backward for a robot that only rolls."""
-    rolls = straight_and_pivot(robot)
-    return (
-        _EVERY_WAY if rolls is None else tuple(round(math.degrees(rolls[0]) + back, _DIGITS) for back in (0.0, 180.0))
-    )
+    rolling, _ = straight_and_pivot(robot)
+    if rolling is None:
+        return _EVERY_WAY
+    return tuple(round(math.degrees(rolling) + back, _DIGITS) for back in (0.0, 180.0))
 
 
 def steering_limit(robot: Robot, degrees: float | None) -> float:
     """The largest steering angle, rad: as given in degrees, or the default of the robot's type."""
-    if degrees is None:
-        degrees = STEERING_LIMITS.get(class_of(robot), _LARGEST)
-    return math.radians(degrees)
+    return math.radians(STEERING_LIMITS.get(class_of(robot), _LARGEST) if degrees is None else degrees)
 
 
 def wheels_of(robot: Robot, twist: Array) -> tuple[Array, Array]:
@@ -92,10 +89,10 @@ def is_within(robot: Robot, command: Command, limit: float) -> bool:
     """True if the robot can drive a command with steering angles up to a limit, rad."""
     if robot.drive.direct:
         return True
-    wanted = robot.signal_equations @ command.twist
+    signals = robot.signal_equations @ command.twist
     rates, steering = wheels_of(robot, command.twist)
     driven = robot.drive.signals(rates[None], steering[None])[0]
-    missed = np.abs(driven - wanted).max() > _SLACK * max(np.abs(wanted).max(), 1e-9)
+    missed = np.abs(driven - signals).max() > _SLACK * max(np.abs(signals).max(), 1e-9)
     return not missed and np.abs(steering).max() <= limit + _SLACK
 
 
@@ -104,28 +101,21 @@ def sharpest_turn(robot: Robot, command: Command, limit: float) -> float:
     low, high = 0.0, 1.0
     for _ in range(50):
         middle = (low + high) / 2
-        turning = Command(command.speed, command.direction, middle * command.turn_rate, command.pivot)
+        turning = replace(command, turn_rate=middle * command.turn_rate)
         low, high = (middle, high) if is_within(robot, turning, limit) else (low, middle)
     return low * abs(command.turn_rate)
 
 
-def unsteerable(robot: Robot, commands: Sequence[Command], degrees: float | None) -> list[Command]:
-    """The commands that are beyond a robot's steering limit, deg, or need it to turn on the spot."""
-    if robot.drive.direct:
-        return []
-    limit = steering_limit(robot, degrees)
-    return [command for command in commands if not is_within(robot, command, limit)]
-
-
-def beyond_steering(robot: Robot, left_out: Sequence[Command], degrees: float | None) -> str:
-    """The reason why commands cannot be driven, in words, by the example of the first, and what to give instead."""
-    first, limit = left_out[0], steering_limit(robot, degrees)
+def beyond_steering(robot: Robot, commands: Sequence[Command], limit: float) -> str:
+    """Why the first of the commands beyond a steering limit, rad, cannot be driven, and what to give instead."""
+    first = next(command for command in commands if not is_within(robot, command, limit))
+    degrees = math.degrees(limit)
     if not first.speed:
-        return f"{first.name} turns on the spot, which steering angles up to {math.degrees(limit):g} deg do not allow"
+        return f"{first.name} turns on the spot, which steering angles up to {degrees:g} deg do not allow"
     sharpest = sharpest_turn(robot, first, limit)
     radius = f", a radius of {first.speed / sharpest:.3g} m" if sharpest else ""
     return (
-        f"{first.name} needs more than steering_limit_deg {math.degrees(limit):g}; at {first.speed:g} m/s it turns by "
+        f"{first.name} needs more than steering_limit_deg {degrees:g}; at {first.speed:g} m/s it turns by "
         f"at most {sharpest:.3g} rad/s{radius}"
     )
 
@@ -154,6 +144,9 @@ class Variation(Model):
         ends: at the samples' ends, else in their middles. Between two reversals steering angles are continuous; after
         each a wheel that would steer by more than a quarter turn drives backward.
         """
+        if self.is_none:
+            held, angles = wheels_of(robot, command.twist)
+            return np.tile(held, (len(times), 1)), np.tile(angles, (len(times), 1))
         middles = times - np.diff(times, prepend=0.0) / 2
         legs = np.floor(middles / times[-1] * (self.reversals + 1)).astype(int)
         swing = self.weave * np.sin(2 * math.pi / self.period * (times if ends else middles))
@@ -163,22 +156,16 @@ class Variation(Model):
         rates, steering = robot.drive.commands(twists @ robot.signal_equations.T)
         for wheel, pair in enumerate(robot.drive.pairs):
             if pair >= 0:
-                angles = _within_legs(steering[:, pair], legs)
+                angles = steering[:, pair].copy()
+                for leg in np.unique(legs):  # of rolling either way: continuous, and begins within a quarter turn
+                    part = np.unwrap(angles[legs == leg], period=math.pi)
+                    angles[legs == leg] = part - math.pi * round(part[0] / math.pi)
                 rates[:, wheel] *= np.sign(np.cos(angles - steering[:, pair]))
                 steering[:, pair] = angles
         return rates, steering
 
 
 STEADY = Variation()  # a run holds its command throughout
-
-
-def _within_legs(angles: Array, legs: NDArray[np.intp]) -> Array:
-    """Directions (F,) of rolling, rad, either way: continuous in each leg, which begins within a quarter turn."""
-    chosen = np.empty_like(angles)
-    for leg in np.unique(legs):
-        part = np.unwrap(angles[legs == leg], period=math.pi)
-        chosen[legs == leg] = part - math.pi * round(part[0] / math.pi)
-    return chosen
 
 
 @dataclass(frozen=True)
@@ -207,37 +194,20 @@ class MotionGrid(Model):
     turn_rates: tuple[FiniteFloat, ...] = Field(min_length=1, description="rad/s")
     turn_duration: Positive = Field(6.0, description="duration of turns on the spot, s")
 
-    @property
-    def moves(self) -> bool:
-        """True if some command moves the robot."""
-        return any(self.speeds) or any(self.turn_rates)
+    def grid(self, robot: Robot) -> list[Command]:
+        """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
 
-    def directions(self, robot: Robot) -> tuple[float, ...]:
-        """Directions, deg, for a robot. ValueError: its fixed wheels do not roll in one that is given."""
-        if self.directions_deg is None:
-            return default_directions(robot)
-        rolls = straight_and_pivot(robot)
-        for direction in self.directions_deg:
-            if rolls is not None and abs(math.sin(math.radians(direction) - rolls[0])) > _ASIDE:
+        ValueError: the robot's fixed wheels do not roll in a direction.
+        """
+        rolling, pivot = straight_and_pivot(robot)
+        for direction in self.directions_deg or ():
+            if rolling is not None and abs(math.sin(math.radians(direction) - rolling)) > _ASIDE:
                 forward, backward = default_directions(robot)
                 raise ValueError(
                     f"directions_deg: this robot's fixed wheels would slide at {direction:g} deg; give {forward:g} and "
                     f"{backward:g}, or leave directions_deg out"
                 )
-        return self.directions_deg
-
-    def extremes(self, command: Command) -> tuple[Command, ...]:
-        """The commands between which a run of this one varies."""
-        return (command,)
-
-    def grid(self, robot: Robot) -> list[Command]:
-        """Every direction with every rate of turn, at each speed; the direction of a turn on the spot is 0.
-
-        ValueError as for ``directions``.
-        """
-        rolls = straight_and_pivot(robot)
-        pivot = (0.0, 0.0) if rolls is None else rolls[1]
-        directions = self.directions(robot)
+        directions = default_directions(robot) if self.directions_deg is None else self.directions_deg
         return [
             Command(speed, math.radians(direction), turn_rate, pivot)
             for speed, turn_rate in product(self.speeds, self.turn_rates)
@@ -293,13 +263,6 @@ class Commands(MotionGrid):
             raise ValueError("give turn_rates (rad/s) of a grid of commands, or listed commands")
         return self
 
-    @property
-    def moves(self) -> bool:
-        return bool(self.listed) or super().moves
-
-    def extremes(self, command: Command) -> tuple[Command, ...]:
-        return self.variation.extremes(command)
-
     def grid(self, robot: Robot) -> list[Command]:
         if not self.listed:
             return super().grid(robot)
@@ -346,14 +309,13 @@ class DrivableCommands:
 
     def __iter__(self) -> Iterator[TimedCommand]:
         """Lines, arcs to both sides and turns on the spot, each as fast as the limits and the pace allow."""
-        rolls = straight_and_pivot(self.robot)
-        pivot = (0.0, 0.0) if rolls is None else rolls[1]
+        _, pivot = straight_and_pivot(self.robot)
         for pace in self.shapes.paces:
             for direction in map(math.radians, default_directions(self.robot)):
                 if line := self._drivable(direction, 0.0, pivot, pace):
                     longest = min(max(self.free), LONGEST * line.speed)
                     for share in self.shapes.lines:
-                        yield TimedCommand(line, tidy(share * longest) / line.speed)
+                        yield TimedCommand(line, rounded_down(share * longest) / line.speed)
                 for radius, side in product(self._radii(direction, pivot), (1.0, -1.0)):
                     if arc := self._drivable(direction, side / radius, pivot, pace):
                         durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
@@ -367,21 +329,20 @@ class DrivableCommands:
 
     def _radii(self, direction: float, pivot: tuple[float, float]) -> list[float]:
         """Radii of arcs, m: shares of the area, and a little more than the smallest that a robot steers."""
-        radii = [tidy(share * max(self.free)) for share in self.shapes.radii]
+        radii = [rounded_down(share * max(self.free)) for share in self.shapes.radii]
         if self.robot.drive.direct:
             return radii
         sharpest = sharpest_turn(self.robot, Command(1.0, direction, 1 / SHORTEST, pivot), self.steering_limit)
         if not sharpest:
             return []
-        tightest = 1 / sharpest
-        return [tidy(_ROOM_TO_STEER * tightest), *radii] if tightest > SHORTEST else radii
+        return [rounded_down(_ROOM_TO_STEER * (1 / sharpest)), *radii] if 1 / sharpest > SHORTEST else radii
 
     def _drivable(self, direction: float, curvature: float, pivot: tuple[float, float], pace: float) -> Command | None:
         """The fastest command of a shape within the limits, times a pace; None beyond the steering limit.
 
         curvature: 1/m.
         """
-        speed = tidy(pace * self._slower(Command(1.0, direction, curvature, pivot)))
+        speed = rounded_down(pace * self._slower(Command(1.0, direction, curvature, pivot)))
         command = Command(speed, direction, curvature * speed, pivot)
         return command if is_within(self.robot, command, self.steering_limit) else None
 
@@ -394,22 +355,20 @@ class DrivableCommands:
         return float(min(limits))
 
     def _of_length(self, command: Command, durations: list[float]) -> Iterator[TimedCommand]:
-        """The command for those durations, s, that are neither too long nor lead out of the area."""
+        """The command for those durations, s, that are neither too short or long nor lead out of the area, from some
+        start and heading."""
         for duration in durations:
-            long_enough = not command.speed or command.speed * duration >= SHORTEST
-            if long_enough and duration <= LONGEST and self._fits(command.twist * duration):
+            if duration > LONGEST or 0 < command.speed * duration < SHORTEST:
+                continue
+            motion = TrueMotion(np.ones(1), np.zeros(3), command.twist[None] * duration, "arc")
+            path = motion.poses(np.linspace(0.0, 1.0, _POINTS))
+            turned = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * _HEADINGS)[:, None]
+            wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
+            if ((wide <= self.free[0] + 1e-9) & (deep <= self.free[1] + 1e-9)).any():
                 yield TimedCommand(command, duration)
 
-    def _fits(self, moved: Array) -> bool:
-        """True if the path of a constant twist stays in the area from some start and heading. moved (3,): m, m, rad."""
-        path = TrueMotion(np.ones(1), np.zeros(3), moved[None], "arc").poses(np.linspace(0.0, 1.0, _POINTS))
-        places = path[:, 0] + 1j * path[:, 1]
-        turned = places * np.exp(1j * _HEADINGS)[:, None]
-        wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
-        return bool(((wide <= self.free[0] + 1e-9) & (deep <= self.free[1] + 1e-9)).any())
 
-
-def tidy(value: float) -> float:
-    """A value rounded down to two digits, as a person sets it."""
-    digits = 1 - math.floor(math.log10(value))
-    return math.floor(value * 10.0**digits + 1e-9) / 10.0**digits
+def rounded_down(value: float, digits: int = 2) -> float:
+    """A value rounded down to so many digits, as a person sets it."""
+    decimals = digits - 1 - math.floor(math.log10(value))
+    return math.floor(value * 10.0**decimals + 1e-9) / 10.0**decimals

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
@@ -206,8 +206,13 @@ def make_plan(room: RoomPlan, where: str) -> FloorPlan:
     ConfigError in one line: an unknown plan, a start that is not free, or a polygon with fewer than three corners,
     without area, that crosses itself, lies outside the boundary or covers all of it.
     """
-    drawing, name = _drawing(room, where)
-    start = drawing.start
+    if room.plan is None:
+        drawn = {f"obstacles[{index}]": corners for index, corners in enumerate(room.obstacles)}
+        drawing, name = Drawing(room.boundary or (), (0.0, 0.0, 0.0), drawn), "drawn in the config"
+    else:
+        require_choice("plan", room.plan, PLANS, where)
+        drawing, name = PLANS[room.plan], room.plan
+    x, y, heading = room.start or drawing.start
     walls = _polygon(drawing.boundary, f"{where}.boundary")
     inner = {each: _polygon(corners, f"{where}.{each}") for each, corners in drawing.obstacles.items()}
     room_and_wall = walls.buffer(_OUTSIDE, join_style="mitre")
@@ -223,14 +228,17 @@ def make_plan(room: RoomPlan, where: str) -> FloorPlan:
     free = walls.difference(shapely.union_all(list(inner.values())))
     if free.area < _SMALLEST_AREA:
         raise ConfigError(f"{where}.obstacles: they cover the whole room together; leave the robot some floor")
-    edges = [_edges(polygon) for polygon in (walls, *inner.values())]
+    edges = []  # both ends (E, 4) of each edge, without those between repeated corners
+    for polygon in (walls, *inner.values()):
+        ends = shapely.get_coordinates(polygon.exterior)
+        edges.append(np.hstack([ends[:-1], ends[1:]])[(ends[:-1] != ends[1:]).any(axis=1)])
     shapely.prepare(free)
     plan = FloorPlan(
         name,
         walls,
         tuple(inner.values()),
         tuple(inner),
-        np.array([start[0], start[1], math.radians(start[2])]),
+        np.array([x, y, math.radians(heading)]),
         np.concatenate(edges),
         np.repeat(np.arange(len(edges)) - 1, [len(each) for each in edges]),
         free,
@@ -239,16 +247,6 @@ def make_plan(room: RoomPlan, where: str) -> FloorPlan:
     if blocked is not None:
         raise ConfigError(f"{where}.start: ({_place(plan.start)}) m is {blocked}; start where the floor is free")
     return plan
-
-
-def _drawing(room: RoomPlan, where: str) -> tuple[Drawing, str]:
-    """Drawing of a config's room, and its name."""
-    if room.plan is None:
-        obstacles = {f"obstacles[{index}]": corners for index, corners in enumerate(room.obstacles)}
-        return Drawing(room.boundary or (), room.start or (0.0, 0.0, 0.0), obstacles), "drawn in the config"
-    require_choice("plan", room.plan, PLANS, where)
-    ready = PLANS[room.plan]
-    return replace(ready, start=room.start or ready.start), room.plan
 
 
 def _polygon(corners: Sequence[Corner], where: str) -> Polygon:
@@ -267,13 +265,6 @@ def _polygon(corners: Sequence[Corner], where: str) -> Polygon:
         place = f" at ({_place((float(match[2]), float(match[3])))}) m" if match else ""
         raise ConfigError(f"{where}: crosses or touches itself{place}; give its corners in their order along the walls")
     return polygon
-
-
-def _edges(polygon: Polygon) -> Array:
-    """Both ends (E, 4) of each edge, without edges between repeated corners."""
-    corners = shapely.get_coordinates(polygon.exterior)
-    edges = np.hstack([corners[:-1], corners[1:]])
-    return edges[(edges[:, :2] != edges[:, 2:]).any(axis=1)]
 
 
 def _place(position: Sequence[float] | Array) -> str:

@@ -1,4 +1,4 @@
-"""A simulated planar LIDAR: ranges from the robot's true poses, ray by ray as the mirror turns."""
+"""A simulated planar LIDAR: ranges from the robot's true poses to the nearest walls, ray by ray as the mirror turns."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.data.scans import Mount, Scanner, TrajectoryScans
 from omnibench.data.true_poses import TruePath
 from omnibench.errors import DataError
+from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array, compose
 from omnibench.simulate.floor_plan import FloorPlan
 
@@ -74,9 +75,7 @@ class Lidar(Model):
                 f"(given: {low:g}, {high:g})"
             )
         if low < self.sweep:
-            raise ValueError(
-                f"period: {low:g} s; a scan alone takes {self.sweep:g} s, give more or a shorter turn_time"
-            )
+            raise ValueError(f"period: {low:g} s; a scan takes {self.sweep:g} s, give more or a shorter turn_time")
         return self
 
     @property
@@ -111,9 +110,7 @@ def scan_stamps(lidar: Lidar, end: float, rng: np.random.Generator) -> Array:
     """
     last = end - max(lidar.sweep - lidar.latency, 0.0)
     if last < 0:
-        raise DataError(
-            f"the run ends at {end:g} s, before the LIDAR's first scan is over; drive longer or let it rest"
-        )
+        raise DataError(f"the run ends at {end:g} s, before the LIDAR's first scan; drive longer or let it rest")
     low, high = lidar.period
     between = rng.uniform(low, high, size=math.ceil(last / low))
     stamps = np.concatenate([[0.0], np.cumsum(between)])
@@ -129,11 +126,15 @@ def measure_scans(
     scanner reach; its rays end on the floor where that is nearer. DataError in one line: the scanner is inside a wall,
     or a scan sees nothing.
     """
-    from omnibench.simulate.ray_casting import cast_rays  # numba takes half a second to load
-
     scanner = lidar.scanner
     measured = stamps - lidar.latency
-    _check_places(plan, scanner.mount, track, measured)
+    x, y, _ = compose(track.at(measured), scanner.mount.pose).T
+    for row in np.flatnonzero(~shapely.contains_xy(plan.free, x, y))[:1]:
+        place = plan.place_of(np.array([x[row], y[row]]))
+        raise DataError(
+            f"the LIDAR at ({x[row]:.2f}, {y[row]:.2f}) m is {place} of the room {plan.name} at {measured[row]:g} s; "
+            "check lidar.mount, the robot's radius and the way it drives"
+        )
     to_walls = cast_rays(plan.segments, scanner, track.times, track.poses, measured) / scanner.level_shares
     true = np.minimum(to_walls, scanner.floor_ranges)
     ranges = true + rng.standard_normal(true.shape) * np.where(true > lidar.far, lidar.far_noise, lidar.noise)
@@ -149,11 +150,72 @@ def measure_scans(
     return TrajectoryScans(stamps, np.where(seen, ranges, np.inf).astype(np.float32))
 
 
-def _check_places(plan: FloorPlan, mount: Mount, track: TruePath, times: Array) -> None:
-    x, y, _ = compose(track.at(times), mount.pose).T
-    for row in np.flatnonzero(~shapely.contains_xy(plan.free, x, y))[:1]:
-        place = plan.place_of(np.array([x[row], y[row]]))
-        raise DataError(
-            f"the LIDAR at ({x[row]:.2f}, {y[row]:.2f}) m is {place} of the room {plan.name} at {times[row]:g} s; "
-            "check lidar.mount, the robot's radius and the way it drives"
-        )
+def cast_rays(segments: Array, scanner: Scanner, track_times: Array, track_poses: Array, times: Array) -> Array:
+    """True distances (S, R) over the floor, m, from a moving scanner to the nearest wall along its rays; inf: none.
+
+    segments (W, 4): x, y of both ends of each wall, m. track_poses (M, 3): the robot's poses at track_times
+    (M,), interpolated linearly, constant outside. times (S,): times of the scans' first rays, s.
+    """
+    mount = scanner.mount
+    segments, track_times, track_poses, times = (
+        np.ascontiguousarray(array, dtype=float) for array in (segments, track_times, track_poses, times)
+    )
+    x, y = float(mount.x), float(mount.y)
+    return _cast(segments, track_times, track_poses, times, scanner.delays, scanner.bearings, x, y)
+
+
+@compiled
+def _cast(
+    segments: Array, track_times: Array, track_poses: Array, times: Array, delays: Array, angles: Array,
+    mount_x: float, mount_y: float,
+) -> Array:  # fmt: skip
+    distances = np.empty((len(times), len(angles)))
+    for scan in range(len(times)):
+        after = np.searchsorted(track_times, times[scan])
+        for ray in range(len(angles)):
+            time = times[scan] + delays[ray]
+            while after < len(track_times) and track_times[after] < time:
+                after += 1
+            x, y, heading = _pose(track_times, track_poses, after, time)
+            cosine, sine = math.cos(heading), math.sin(heading)
+            x, y = x + cosine * mount_x - sine * mount_y, y + sine * mount_x + cosine * mount_y
+            turned = heading + angles[ray]
+            distances[scan, ray] = _nearest(segments, x, y, math.cos(turned), math.sin(turned))
+    return distances
+
+
+@compiled
+def _pose(track_times: Array, track_poses: Array, after: int, time: float) -> tuple[float, float, float]:
+    """The pose at a time. after: index of the first pose of the track that is not earlier."""
+    before = max(after - 1, 0)
+    after = min(after, len(track_times) - 1)
+    share = (time - track_times[before]) / (track_times[after] - track_times[before]) if after > before else 0.0
+    first, second = track_poses[before], track_poses[after]
+    return (
+        first[0] + share * (second[0] - first[0]),
+        first[1] + share * (second[1] - first[1]),
+        first[2] + share * (second[2] - first[2]),
+    )
+
+
+@compiled
+def _nearest(segments: Array, x: float, y: float, along_x: float, along_y: float) -> float:
+    """Distance from (x, y) to the nearest wall in a direction of length 1.
+
+    A wall is hit if its ends are on either side of the ray. No ray slips through where two walls meet: for both, the
+    corner is on the same side.
+    """
+    nearest = np.inf
+    for wall in range(len(segments)):
+        first_x, first_y = segments[wall, 0] - x, segments[wall, 1] - y
+        second_x, second_y = segments[wall, 2] - x, segments[wall, 3] - y
+        first_left = along_x * first_y - along_y * first_x
+        second_left = along_x * second_y - along_y * second_x
+        if (first_left < 0.0) != (second_left < 0.0):
+            share = first_left / (first_left - second_left)
+            first_ahead = along_x * first_x + along_y * first_y
+            second_ahead = along_x * second_x + along_y * second_y
+            distance = first_ahead + share * (second_ahead - first_ahead)
+            if 0.0 <= distance < nearest:
+                nearest = distance
+    return nearest

@@ -32,7 +32,7 @@ theta), positions as complex numbers, a robot is after a time s at
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -208,16 +208,19 @@ def _with_lag(tau: float, ends: Array, durations: Array) -> Array:
     return path
 
 
+def _with_rates(wheels: Sequence[Wheel], columns: Array) -> Iterator[tuple[Wheel, Array]]:
+    """The wheels with a rate, each with its column (F,) of those (F, S) of the steered wheels; zeros if it is none."""
+    steered = iter(columns.T)
+    for wheel in wheels:
+        column = next(steered) if wheel.has_steering else np.zeros(len(columns))
+        if wheel.has_rate:
+            yield wheel, column
+
+
 def turned_by_steering(values: Values, wheels: Sequence[Wheel], ends: Array, durations: Array) -> Array:
     """Rates (F, N), rad/s, that modules give their wheels when they turn from end to end of a sample (F, S), rad."""
     changes = np.vstack([np.zeros((1, ends.shape[1])), ends[1:] - ends[:-1]]) / durations[:, None]
-    steered = iter(changes.T)
-    turned = []
-    for wheel in wheels:
-        change = next(steered) if wheel.has_steering else np.zeros(len(ends))
-        if wheel.has_rate:
-            turned.append(values["k"] * change)
-    return np.column_stack(turned)
+    return np.column_stack([values["k"] * change for _, change in _with_rates(wheels, changes)])
 
 
 def lost_by_light_wheels(
@@ -231,14 +234,11 @@ def lost_by_light_wheels(
     over_floor = (twists[:, 0] + 1j * twists[:, 1]) * np.exp(1j * headings)
     changes = np.diff(over_floor, prepend=0.0) / durations
     force = changes * np.exp(-1j * headings)  # per mass, along the robot's axes
-    steered = iter(np.zeros((0, 0)) if steering is None else steering.T)
     lost = []
-    for wheel in wheels:
-        angle = next(steered) if wheel.has_steering else np.zeros(len(twists))
-        if wheel.has_rate:
-            grip = np.exp(1j * (wheel.rolling + angle - wheel.roller_angle))
-            rim = wheel.radius * math.cos(wheel.roller_angle)
-            lost.append(values[f"k_{wheel.name}"] * (force * grip.conjugate()).real / rim)
+    for wheel, angle in _with_rates(wheels, np.zeros((len(twists), 0)) if steering is None else steering):
+        grip = np.exp(1j * (wheel.rolling + angle - wheel.roller_angle))
+        rim = wheel.radius * math.cos(wheel.roller_angle)
+        lost.append(values[f"k_{wheel.name}"] * (force * grip.conjugate()).real / rim)
     return np.column_stack(lost)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.simulate.commands import Command, wheels_of
 
@@ -56,27 +55,12 @@ class SetPoint:
     limits: SlewLimits
     phases: tuple[Phase, ...] = (Phase(0.0, 0.0, 0.0),)
 
-    @property
-    def target(self) -> float:
-        """Final value of the scale."""
-        return self.phases[-1].scale
-
-    @property
-    def end(self) -> float:
-        """Time from which on the scale is constant, s."""
-        return self.phases[-1].start
-
-    @property
-    def way(self) -> float:
-        """Integral of the scale over a course that ends at rest, s at full speed."""
-        return self.phases[-1].way
-
     def towards(self, target: float, time: float) -> SetPoint:
         """The course that leaves this one at ``time`` (s, from 0 on) for ``target``, as fast as the limits allow.
 
         A scale between 0 and 1 that is sent to 0 or to 1 stays between them.
         """
-        if target == self.target:
+        if target == self.phases[-1].scale:
             return self
         now = next(phase for phase in reversed(self.phases) if phase.start <= time).at(time)
         driven = (phase for phase in self.phases if phase.start < time)
@@ -155,10 +139,7 @@ class CommandLink(Model):
     @model_validator(mode="after")
     def _goes_on(self) -> CommandLink:
         if self.watchdog < self.refresh:
-            raise ValueError(
-                f"watchdog {self.watchdog:g} s is shorter than refresh {self.refresh:g} s; "
-                "the robot would stop before every command"
-            )
+            raise ValueError(f"watchdog {self.watchdog:g} s is shorter than refresh {self.refresh:g} s; give more")
         return self
 
 
@@ -217,14 +198,10 @@ def command_motion(
     The planner knows how far the set point has come. It refreshes the command until the distance is covered, also when
     commands are lost; the validity of the last command makes the robot come to rest there. A link that stalls leaves
     the run incomplete. A rest of ``settle``, s, follows.
-
-    ConfigError: the command does not move the robot.
     """
-    if not command.speed and not command.turn_rate:
-        raise ConfigError(f"command {command.name} does not move the robot; give it a speed or a rate of turn")
     seconds = way / command.speed if way is not None and command.speed else turn_duration
     set_point, sent, stops = _planned(seconds, SetPoint(profile.limits(command)), link, rng)
-    samples = max(1, math.ceil((set_point.end + settle) / sample_period - 1e-9))
+    samples = max(1, math.ceil((set_point.phases[-1].start + settle) / sample_period - 1e-9))
     times: Array = sample_period * np.arange(1, samples + 1)
     shares = np.diff(set_point.ways(np.append(0.0, times))) / sample_period
     ended = tuple((since, min(until, float(times[-1]))) for since, until in stops)
@@ -287,7 +264,7 @@ def _needed(set_point: SetPoint, now: float, seconds: float, longest: float) -> 
     driving = set_point.towards(1.0, now)
 
     def missing(duration: float) -> float:
-        return seconds - driving.towards(0.0, now + duration).way
+        return seconds - driving.towards(0.0, now + duration).phases[-1].way
 
     if missing(0.0) <= 0:
         return 0.0

@@ -23,8 +23,7 @@ from omnibench.config import Model, NonNegative, Positive
 from omnibench.errors import ConfigError
 from omnibench.robot.compiled import compiled
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.simulate.commands import Command, wheels_of
-from omnibench.words import plural
+from omnibench.simulate.commands import Command, rounded_down, wheels_of
 
 TRUE_STEP = 1e-3  # s between the true wheel angles that are kept (chosen: a tenth of the usual sample period)
 _RESERVE = 0.1  # share of the fastest rate that is left to the controller (chosen)
@@ -104,60 +103,44 @@ class Encoder(Model):
         return 2 * math.pi / self.ticks
 
 
-def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor | Sequence[Motor]) -> None:
+def check_reach(robot: Robot, commands: Sequence[Command], motor: Motor) -> None:
     """ConfigError in one line for a command that needs a higher wheel rate than the motor reaches.
 
     A tenth of the motor's fastest rate is left to the controller.
     """
-    motors = motors_of_wheels(motor, len(robot.wheel_names))
-    limits = (1 - _RESERVE) * np.array([each.fastest_rate for each in motors])
+    limit = (1 - _RESERVE) * motor.fastest_rate
     for command in commands:
-        rates, _ = wheels_of(robot, command.twist)
-        wheel = int(np.argmax(np.abs(rates) / limits))
-        if abs(rates[wheel]) > limits[wheel]:
+        rates = np.abs(wheels_of(robot, command.twist)[0])
+        wheel = int(np.argmax(rates))
+        if rates[wheel] > limit:
             raise ConfigError(
                 f"command {command.name} (speed {command.speed:g} m/s, direction {math.degrees(command.direction):g} "
                 f"deg, turn rate {command.turn_rate:g} rad/s) is faster than the motors can go: wheel "
-                f"{robot.wheel_names[wheel]} would need {abs(rates[wheel]):.4g} rad/s, its motor reaches "
-                f"{motors[wheel].fastest_rate:.4g} rad/s, of which the controller keeps {_RESERVE:.0%}; "
-                f"{_way_out(robot, command, limits)}"
+                f"{robot.wheel_names[wheel]} would need {rates[wheel]:.4g} rad/s, its motor reaches "
+                f"{motor.fastest_rate:.4g} rad/s, of which the controller keeps {_RESERVE:.0%}; "
+                f"{_way_out(robot, command, limit)}"
             )
 
 
-def _way_out(robot: Robot, command: Command, limits: Array) -> str:
-    """Advice: the greatest speed at this rate of turn; if there is none, the greatest rate of turn."""
+def _way_out(robot: Robot, command: Command, limit: float) -> str:
+    """Advice: the greatest speed at this rate of turn; if there is none, the greatest rate of turn. limit: rad/s."""
+    turning = abs(command.turn_rate)
     if not robot.drive.direct:
-        share = float(np.min(limits / np.maximum(np.abs(wheels_of(robot, command.twist)[0]), 1e-9)))
+        share = limit / float(np.abs(wheels_of(robot, command.twist)[0]).max())
         if not command.speed:
-            return f"give it a turn rate of at most {_rounded_down(share * abs(command.turn_rate))} rad/s"
-        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s, and a turn rate as much lower"
+            return f"give it a turn rate of at most {rounded_down(share * turning, 3):g} rad/s"
+        speed = rounded_down(share * command.speed, 3)
+        return f"give it a speed of at most {speed:g} m/s, and a turn rate as much lower"
     straight, across, turn = (robot.signal_equations * command.twist).T
     travel = straight + across
-    left = limits - np.abs(turn)
+    left = limit - np.abs(turn)
     if command.speed and (left > 0).all():
-        rooms = np.where(travel * turn >= 0, left, limits + np.abs(turn))
-        share = np.min(rooms[travel != 0] / np.abs(travel[travel != 0]))
-        return f"give it a speed of at most {_rounded_down(share * command.speed)} m/s"
-    greatest = _rounded_down(abs(command.turn_rate) * np.min(limits[turn != 0] / np.abs(turn[turn != 0])))
-    return f"turning at more than {greatest} rad/s alone is too fast; give it a lower turn rate" + (
-        " and speed" if command.speed else ""
-    )
-
-
-def _rounded_down(value: float) -> str:
-    """The value with three digits, rounded down."""
-    digits = 2 - math.floor(math.log10(value))
-    return f"{math.floor(value * 10.0**digits) / 10.0**digits:g}"
-
-
-def motors_of_wheels(motor: Motor | Sequence[Motor], wheels: int) -> list[Motor]:
-    """The motor of each wheel. ConfigError: there are not as many motors as wheels."""
-    motors = [motor] * wheels if isinstance(motor, Motor) else list(motor)
-    if len(motors) != wheels:
-        raise ConfigError(
-            f"{plural(len(motors), 'motor')} for {plural(wheels, 'wheel')}; give one for each, or one for all"
-        )
-    return motors
+        rooms = np.where(travel * turn >= 0, left, limit + np.abs(turn))
+        share = float(np.min(rooms[travel != 0] / np.abs(travel[travel != 0])))
+        return f"give it a speed of at most {rounded_down(share * command.speed, 3):g} m/s"
+    greatest = rounded_down(turning * limit / float(np.abs(turn).max()), 3)
+    lower = "turn rate and speed" if command.speed else "turn rate"
+    return f"turning at more than {greatest:g} rad/s alone is too fast; give it a lower {lower}"
 
 
 _INNER = 10  # steps of the motor's equations within TRUE_STEP
@@ -283,7 +266,7 @@ class DrivenRun:
 
 
 def drive_session(
-    motor: Motor | Sequence[Motor],
+    motor: Motor,
     controller: Controller,
     encoder: Encoder,
     targets: Sequence[Array],
@@ -292,20 +275,17 @@ def drive_session(
 ) -> list[DrivenRun]:
     """The runs of a session, each from rest at the wheel angles where the one before has ended.
 
-    motor: one for all wheels, or one for each. targets: rates of each run (F, N), rad/s. start_angles: (N,), rad.
-    ConfigError: a sample period that is not a whole number of milliseconds, or not as many motors as wheels.
+    motor: of every wheel. targets: rates of each run (F, N), rad/s. sample_period: a whole number of milliseconds, s.
+    start_angles: (N,), rad.
     """
     steps = round(sample_period / TRUE_STEP)
-    if steps < 1 or abs(sample_period - steps * TRUE_STEP) > 1e-9:
-        raise ConfigError(f"sample_period {sample_period:g} s: the motors need a whole number of milliseconds")
-    gains = (controller.proportional, controller.integral, controller.derivative)
-    motors = motors_of_wheels(motor, len(start_angles))
-    drives = [(motor_steps(each), Pid(*gains, each.supply_voltage)) for each in motors]
+    pid = Pid(controller.proportional, controller.integral, controller.derivative, motor.supply_voltage)
+    drive = motor_steps(motor), pid
     angles, runs = np.asarray(start_angles, float), []
     for rates in targets:
         wheels = [
             drive_wheel(*drive, encoder.tick, np.ascontiguousarray(wheel_rates, float), angle, steps)
-            for drive, wheel_rates, angle in zip(drives, rates.T, angles, strict=True)
+            for wheel_rates, angle in zip(rates.T, angles, strict=True)
         ]
         true, counts, voltages = (np.column_stack(columns) for columns in zip(*wheels, strict=True))
         seen = np.vstack([np.floor(angles / encoder.tick), counts])

@@ -101,21 +101,8 @@ class TrueRobot:
 
     def poses(self, log: WheelLog) -> kinematics.Array:
         """True poses (S, 3) of the tracked point at the log's stamps."""
-        return self.model.poses([log])[0] if self._by_model else self._path(log).poses(log.stamps)
-
-    def reported(self, log: WheelLog) -> kinematics.Array:
-        """Poses (S, 3) that an exact reference reports at the log's stamps, with the effects on it."""
         if self._by_model:
-            return self.model.reported([log])[0]
-        terms = self.model.reference_terms
-        return reported_poses(terms, [log], lambda logs: [self.poses(each) for each in logs])[0]
-
-    @property
-    def _by_model(self) -> bool:
-        """True if the model has the whole motion: without contacts, and without mechanics beside them."""
-        return self.contacts is None and physics.MECHANICS.isdisjoint(term.name for term in self.model.motion_terms)
-
-    def _path(self, log: WheelLog) -> physics.TrueMotion:
+            return self.model.poses([log])[0]
         twists, true = self._motion(log)
         if true.body is not None:
             twists = twists + true.body
@@ -124,7 +111,19 @@ class TrueRobot:
             twists = self.contacts.tracked(twists)
         elif mount is not None:
             twists = twists @ mount.twist.T
-        return physics.TrueMotion(log.times, log.start, twists, self.model.integration, true.world)
+        motion = physics.TrueMotion(log.times, log.start, twists, self.model.integration, true.world)
+        return motion.poses(log.stamps)
+
+    def reported(self, log: WheelLog) -> kinematics.Array:
+        """Poses (S, 3) that an exact reference reports at the log's stamps, with the effects on it."""
+        if self._by_model:
+            return self.model.reported([log])[0]
+        return reported_poses(self.model.reference_terms, [log], lambda logs: [*map(self.poses, logs)])[0]
+
+    @property
+    def _by_model(self) -> bool:
+        """True if the model has the whole motion: without contacts, and without mechanics beside them."""
+        return self.contacts is None and physics.MECHANICS.isdisjoint(term.name for term in self.model.motion_terms)
 
     def _motion(self, log: WheelLog) -> tuple[kinematics.Array, Corrected]:
         """Twists (F, 3) of the centre that the true wheels give, and the effects of motion on a log."""
@@ -156,9 +155,8 @@ class TrueRobot:
             for term in terms:
                 if term.name in physics.STEERING:
                     ends = physics.steering_truth(term.name, term.values, ends, durations)
-            true = replace(
-                true, steering=true.steering + kinematics.in_the_middle(ends) - kinematics.in_the_middle(log.steering)
-            )
+            turned_to = true.steering + kinematics.in_the_middle(ends) - kinematics.in_the_middle(log.steering)
+            true = replace(true, steering=turned_to)
             for term in terms:
                 if term.name == physics.COUPLING:
                     turned = physics.turned_by_steering(term.values, robot.wheels, log.steering, durations)
@@ -199,14 +197,13 @@ class TruthRecord(Model):
 
         OmnibenchError in one line: an effect or a parameter is unknown, or a parameter is missing.
         """
-        where = _place(self.dataset)
         robot = self.robot if self.mount is None else self.robot.model_copy(update={"mount": self.mount})
-        terms = tuple(effect.term(robot, where) for effect in self.effects)
+        terms = tuple(effect.term(robot, f"data set {self.dataset}: truth.effects") for effect in self.effects)
         model = OdometryModel(robot, np.array(self.matrix), self.integration, terms, step or self.sample_period)
         contacts = None
-        if self.wheels is not None and not _moved_by_matrix(self.robot, self.mount):
-            offsets = [self.steering_offsets[name] for name in self.robot.drive.steered]
-            contacts = physics.WheelContacts(self.robot, self.wheels, offsets, self.mount, self.lateral_friction)
+        if self.wheels is not None:
+            drawn = _Drawn(self.wheels, self.steering_offsets, self.mount)
+            contacts = drawn.contacts(self.robot, self.lateral_friction)
         return TrueRobot(model, contacts)
 
 
@@ -215,18 +212,16 @@ def true_record(config: Experiment[Any], dataset: str) -> TruthRecord:
 
     UnknownNameError: no such effect, or no such parameter for this robot and these sessions.
     """
-    truth, robot = config.truth, config.robot
-    drawn = _drawn(truth, robot)
+    truth, robot, where = config.truth, config.robot, f"data set {dataset}: truth.effects"
+    drawn = _drawn(truth, robot) or _Drawn(None, {}, robot.mount)
     record = TruthRecord(
         dataset=dataset,
         robot=robot,
         sample_period=config.sample_period,
         matrix=matrix_rows(true_matrix(truth, robot)),
-        effects=tuple(_complete(term, robot, tuple(config.sessions), _place(dataset)) for term in truth.effects),
-        wheels=drawn and drawn.wheels,
-        steering_offsets={} if drawn is None else drawn.steering_offsets,
-        mount=robot.mount if drawn is None else drawn.mount,
+        effects=tuple(_complete(term, robot, tuple(config.sessions), where) for term in truth.effects),
         lateral_friction=truth.lateral_friction,
+        **vars(drawn),
     )
     if not isinstance(config, FlowerConfig):
         return record
@@ -242,24 +237,30 @@ def true_matrix(truth: Truth, robot: kinematics.Robot) -> kinematics.Array:
         return np.array(truth.matrix)
     drawn = _drawn(truth, robot)
     assert drawn is not None  # one of the three is given
-    if _moved_by_matrix(robot, drawn.mount):
-        return kinematics.inverse_kinematic_matrix(drawn.wheels)
-    offsets = list(drawn.steering_offsets.values())
-    return physics.WheelContacts(robot, drawn.wheels, offsets, drawn.mount, truth.lateral_friction).matrix
+    assert drawn.wheels is not None
+    contacts = drawn.contacts(robot, truth.lateral_friction)
+    return kinematics.inverse_kinematic_matrix(drawn.wheels) if contacts is None else contacts.matrix
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A robot drawn about its design. steering_offsets: rad, of each wheel whose steering angle is measured."""
+    """A robot drawn about its design, named as in the record; wheels: None where none is drawn."""
 
-    wheels: tuple[kinematics.Wheel, ...]
+    wheels: tuple[kinematics.Wheel, ...] | None
     steering_offsets: dict[str, float]
     mount: kinematics.Mount | None
 
+    def contacts(self, robot: kinematics.Robot, lateral_friction: float) -> physics.WheelContacts | None:
+        """The contacts of the wheels with the floor, of the ``robot`` as designed.
 
-def _moved_by_matrix(robot: kinematics.Robot, mount: kinematics.Mount | None) -> bool:
-    """True for omni and mecanum wheels placed by distance and angle, whose matrix is Eq. (3) or its general form."""
-    return mount is None and all(wheel.distance is not None and wheel.measured for wheel in robot.wheels)
+        None for omni and mecanum wheels placed by distance and angle, which the matrix of Eq. (3) or its general form
+        moves.
+        """
+        if self.mount is None and all(wheel.distance is not None and wheel.measured for wheel in robot.wheels):
+            return None
+        assert self.wheels is not None
+        offsets = [self.steering_offsets[name] for name in robot.drive.steered]
+        return physics.WheelContacts(robot, self.wheels, offsets, self.mount, lateral_friction)
 
 
 def _drawn(truth: Truth, robot: kinematics.Robot) -> _Drawn | None:
@@ -311,10 +312,6 @@ def _complete(term: EffectTerm, robot: kinematics.Robot, sessions: tuple[str, ..
     if unchanged.keys().isdisjoint(term.parameters):
         return term  # whoever uses it refuses it for its missing parameters
     return term.model_copy(update={"parameters": unchanged | term.parameters})
-
-
-def _place(dataset: str) -> str:
-    return f"data set {dataset}: truth.effects"
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Imported
-from omnibench.data.importing import importer_of, read_dataset
+from omnibench.data.importers.dataset_folder import importer_of, read_dataset
 from omnibench.files import check_source
 from omnibench.slam.slam_options import SlamOptions
 

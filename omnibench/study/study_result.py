@@ -49,7 +49,7 @@ from scipy.special import stdtrit
 from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
 from omnibench.environment import Environment
-from omnibench.fit.ratio_intervals import FEWEST, Interval
+from omnibench.fit.intervals import FEWEST, Interval
 from omnibench.registry import calibrators
 from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import INTERVAL

@@ -10,10 +10,19 @@ In a test file, with the plug-in beside it::
 pytest is not needed to run the cases: see :func:`run_cases`.
 """
 
-from omnibench.testing.calibrator_cases import Attempt, CalibratorConformance, CostConformance
-from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, Nonconformance, load_plugin, run_cases
+from omnibench.testing.cases import (
+    Attempt,
+    CalibratorConformance,
+    CaseOutcome,
+    CaseResult,
+    Conformance,
+    CostConformance,
+    ImporterConformance,
+    Nonconformance,
+    load_plugin,
+    run_cases,
+)
 from omnibench.testing.effect_cases import EffectConformance, driven_signals
-from omnibench.testing.importer_cases import ImporterConformance
 from omnibench.testing.synthetic import ObservedProblem, synthetic_problem, synthetic_robot, synthetic_trajectories
 
 __all__ = [

@@ -15,7 +15,7 @@ from omnibench.registry import effects
 from omnibench.robot.effects import effect as contract
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.robot.signals import Caster, Signals, SteeringGears
-from omnibench.testing.conformance import Conformance, global_random_fingerprint, global_random_state, require
+from omnibench.testing.cases import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.synthetic import synthetic_robot, synthetic_robots
 
 PERIOD: Final = 0.01  # s, of the wheel samples
@@ -85,11 +85,6 @@ def trial_values(effect: contract.Effect, robot: Robot, seed: int = 0) -> Iterat
         yield {item.name: chosen[item.name] if item.choices else free[item.name] for item in parameters}
 
 
-def trials(effect: contract.Effect) -> Iterator[tuple[Robot, contract.Values]]:
-    """Every trial robot with its trial parameters."""
-    return ((robot, values) for robot in robots(effect) for values in trial_values(effect, robot))
-
-
 def without(effect: contract.Effect, robot: Robot, values: contract.Values) -> contract.Values:
     """The values with every parameter that has no choices set to 0, at which the effect changes nothing."""
     shapes = {item.name for item in effect.parameters(robot, SESSIONS) if item.choices}
@@ -98,10 +93,10 @@ def without(effect: contract.Effect, robot: Robot, values: contract.Values) -> c
 
 def trial_input(effect: contract.Effect, robot: Robot, speed: float = 1.0, samples: int = SAMPLES) -> Input:
     """Input for an effect of this kind; speed as for ``driven_signals``."""
-    if isinstance(effect, contract.MotionEffect):
-        return driven_signals(robot, samples, speed)
-    if isinstance(effect, contract.ActuatorEffect):
-        return motor_input(robot, samples, speed)
+    if not isinstance(effect, contract.ReferenceEffect):
+        signals = driven_signals(robot, samples, speed)
+        motors = np.full(samples, PERIOD), signals.rates
+        return motors if isinstance(effect, contract.ActuatorEffect) else signals
     poses = trial_poses(samples)
     return 0.25 * np.arange(1, samples + 1), poses[0] + speed * (poses - poses[0]), poses[0]
 
@@ -110,11 +105,6 @@ def trial_poses(count: int = SAMPLES) -> Array:
     """Poses (K, 3) on a curved path away from the origin."""
     angle = np.linspace(0.4, 2.4, count)
     return np.column_stack([1.0 + np.cos(angle), -2.0 + np.sin(2 * angle), 0.3 + angle])
-
-
-def motor_input(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> Motors:
-    """Durations (F,), s, and target rates (F, N), rad/s, of a varied drive."""
-    return np.full(samples, PERIOD), driven_signals(robot, samples, speed).rates
 
 
 def results(effect: contract.Effect, inputs: Input, values: contract.Values) -> dict[str, Array]:
@@ -167,6 +157,13 @@ class EffectConformance(Conformance):
 
     registry = effects
 
+    def trials(self) -> Iterator[tuple[Any, Robot, contract.Values, Input]]:
+        """The effect on every trial robot, with its trial parameters and its input."""
+        effect = self.make()
+        for robot in robots(effect):
+            for values in trial_values(effect, robot):
+                yield effect, robot, values, trial_input(effect, robot)
+
     def test_physics_and_source_are_given(self) -> None:
         """Reports print them beside the name."""
         effect = self.make()
@@ -201,9 +198,8 @@ class EffectConformance(Conformance):
             parameters = self.make().parameters(robot, SESSIONS)
             valid = isinstance(parameters, tuple) and all(isinstance(item, contract.Parameter) for item in parameters)
             require(valid, "parameters must give a tuple of Parameter")
-            require(
-                any(not item.choices for item in parameters), "it needs a parameter without choices, 0 for no effect"
-            )
+            acts = any(not item.choices for item in parameters)
+            require(acts, "it needs a parameter without choices, 0 for no effect")
             for parameter in parameters:
                 place, low, high = f"parameter {parameter.name!r}", parameter.low, parameter.high
                 named = bool(parameter.name) and parameter.name.isprintable()
@@ -227,8 +223,7 @@ class EffectConformance(Conformance):
 
     def test_shapes_are_those_of_the_contract(self) -> None:
         """Results have the right shape for one sample and many, three wheels and four."""
-        effect = self.make()
-        for (robot, values), samples in product(trials(effect), (1, SAMPLES)):
+        for (effect, robot, values, _), samples in product(self.trials(), (1, SAMPLES)):
             inputs = trial_input(effect, robot, samples=samples)
             for name, result in results(effect, inputs, values).items():
                 shape, expected = np.shape(result), _shape(name, effect.stage, inputs, robot)
@@ -236,9 +231,7 @@ class EffectConformance(Conformance):
 
     def test_zero_parameters_change_nothing(self) -> None:
         """An effect whose parameters are 0 changes nothing."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, robot, values, inputs in self.trials():
             largest = float(np.abs(changes(effect, inputs, without(effect, robot, values))).max())
             require(largest <= _NOTHING, f"parameters of 0 change something, by {largest:.3g}")
 
@@ -252,8 +245,7 @@ class EffectConformance(Conformance):
 
     def test_results_are_finite(self) -> None:
         """Results are finite while the robot drives, drives fast and stands."""
-        effect = self.make()
-        for (robot, values), speed in product(trials(effect), (0.0, 1.0, 20.0)):
+        for (effect, robot, values, _), speed in product(self.trials(), (0.0, 1.0, 20.0)):
             finite = np.isfinite(changes(effect, trial_input(effect, robot, speed), values)).all()
             require(finite, f"a result is not finite where the robot {'drives' if speed else 'stands'}")
 
@@ -277,9 +269,7 @@ class EffectConformance(Conformance):
 
     def test_inputs_are_left_unchanged(self) -> None:
         """Signals, poses and values are not overwritten."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, _, values, inputs in self.trials():
             before, values_before = {name: array.copy() for name, array in arrays(inputs).items()}, dict(values)
             results(effect, inputs, values)
             same = all(np.array_equal(array, before[name]) for name, array in arrays(inputs).items())
@@ -287,9 +277,7 @@ class EffectConformance(Conformance):
 
     def test_each_sample_is_corrected_by_itself(self) -> None:
         """A sample is corrected the same alone, as in a stream, and in a batch."""
-        effect = self.make()
-        for robot, values in trials(effect):
-            inputs = trial_input(effect, robot)
+        for effect, _, values, inputs in self.trials():
             if not isinstance(inputs, Signals) and len(inputs) == 2:
                 raise SkipTest("only for effects that act in a stream")
             together = changes(effect, inputs, values)
@@ -300,8 +288,7 @@ class EffectConformance(Conformance):
 
     def test_results_are_reproducible(self) -> None:
         """Results are equal in every call and instance, and no global random generator is used."""
-        for robot, values in trials(self.make()):
-            inputs = trial_input(self.make(), robot)
+        for _, _, values, inputs in self.trials():
             repeated = []
             for seed in (1, 2):
                 with global_random_state(seed):
@@ -319,7 +306,7 @@ class EffectConformance(Conformance):
             raise SkipTest("only for effects of motion")
         unused = _OPTIONAL - set(effect.needs)
         bare: dict[str, Any] = dict.fromkeys(unused)
-        for robot, values in trials(effect):
+        for _, robot, values, _ in self.trials():
             try:
                 results(effect, replace(driven_signals(robot), **bare), values)
             except (TypeError, AttributeError) as error:
@@ -332,7 +319,7 @@ class EffectConformance(Conformance):
         if not isinstance(effect, contract.ReferenceEffect):
             raise SkipTest("only for effects of the reference")
         poses = trial_poses()
-        for _, values in trials(effect):
+        for _, _, values, _ in self.trials():
             back = effect.corrected(effect.reported(poses, poses[0], values), poses[0], values)
             error = float(np.abs(back - poses).max())
             require(error <= _ROUNDING, f"corrected(reported(poses)) is off by {error:.3g}")
@@ -342,8 +329,9 @@ class EffectConformance(Conformance):
         effect = self.make()
         if not isinstance(effect, contract.ActuatorEffect):
             raise SkipTest("only for effects of the motors")
-        for robot, values in trials(effect):
-            durations, targets = motor_input(robot)
+        for _, robot, values, _ in self.trials():
+            targets = driven_signals(robot).rates
+            durations = np.full(SAMPLES, PERIOD)
             early = effect.driven(durations[:50], targets[:50], values)
             same = np.allclose(early, effect.driven(durations, targets, values)[:50], rtol=1e-9, atol=_NOTHING)
             require(same, "later targets change earlier wheel rates")

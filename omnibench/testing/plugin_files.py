@@ -22,19 +22,18 @@ from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.jobs.job_process import Processes
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import REGISTRIES, Registry, calibrators, costs, effects, importers, registered_from
-from omnibench.testing.calibrator_cases import CalibratorConformance, CostConformance
-from omnibench.testing.conformance import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
+from omnibench.testing import cases
+from omnibench.testing.cases import CaseOutcome, CaseResult, Conformance, load_plugin, run_cases
 from omnibench.testing.effect_cases import EffectConformance
-from omnibench.testing.importer_cases import ImporterConformance
 
 PluginKind = Literal["calibrator", "importer", "cost", "effect"]
 PLUGIN_KINDS: tuple[PluginKind, ...] = get_args(PluginKind)
 _TEMPLATES = files("omnibench.testing") / "plugin_templates"
 _SUITES: dict[Registry[Any], type[Conformance]] = {
-    calibrators: CalibratorConformance,
-    costs: CostConformance,
+    calibrators: cases.CalibratorConformance,
+    costs: cases.CostConformance,
     effects: EffectConformance,
-    importers: ImporterConformance,
+    importers: cases.ImporterConformance,
 }
 
 
@@ -69,10 +68,7 @@ def new_plugin(
         raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
     if name.startswith(("_", "test_", "conftest")):
         raise ConfigError(f"{name!r} cannot name a plug-in; files that begin with _, test_ or conftest are not loaded")
-    targets = {
-        Path(folder) / f"{name}.py": f"{kind}.py.txt",
-        Path(folder) / f"test_{name}.py": f"test_{kind}.py.txt",
-    }
+    targets = {Path(folder) / f"{kept}{name}.py": f"{kept}{kind}.py.txt" for kept in ("", "test_")}
     refuse_existing(*targets, force=force)
     for registry in REGISTRIES:
         for entry in registry.entries() if registry.kind == kind else ():

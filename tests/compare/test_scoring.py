@@ -26,7 +26,7 @@ from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.evaluate import evaluate
-from omnibench.fit.ratio_intervals import Units
+from omnibench.fit.intervals import Clusters
 from omnibench.registry import calibrators, costs, effects
 from omnibench.robot.calibration import EffectTerm, ModelExtension, read_calibration
 from omnibench.robot.kinematics import Array, Robot, published_matrix
@@ -293,7 +293,7 @@ def scored(
 
 
 def split_score(costs: Array) -> SplitScore:
-    units = Units("run", np.arange(len(costs)))
+    units = Clusters("run", np.arange(len(costs)))
     return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), units, SumOfNorms.rounding)
 
 

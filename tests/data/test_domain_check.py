@@ -9,7 +9,7 @@ import pytest
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.domain_check import extrapolation_warning
 from omnibench.robot.calibration import Calibration, EffectTerm, matrix_rows
-from omnibench.simulate.simulation_request import simulate_like
+from omnibench.simulate.source import simulate_like
 from omnibench.testing import synthetic_robot
 
 ROBOT = synthetic_robot()

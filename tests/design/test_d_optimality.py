@@ -107,11 +107,6 @@ def test_no_candidate_is_driven_more_often_than_allowed(seed: int, most: int, ru
     assert max(counts.max() for counts in designs) == most
 
 
-def test_more_runs_than_allowed_are_refused() -> None:
-    with pytest.raises(ValueError, match="cannot make 11 runs"):
-        d_optimality.rounded(d_optimality.Candidates(information(1), most=2), np.full(5, 0.2), 11)
-
-
 @given(seed=seeds, target=st.floats(0.5, 30.0))
 def test_an_equal_design_reaches_its_target_and_respects_the_bound(seed: int, target: float) -> None:
     candidates = d_optimality.Candidates(information(seed), costs(seed))

@@ -30,8 +30,7 @@ from omnibench.progress import Progress
 from omnibench.report.render import render
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulation_request import simulate_like
-from omnibench.simulate.source import read_simulation, simulate_dataset
+from omnibench.simulate.source import read_simulation, simulate_dataset, simulate_like
 
 
 def test_a_hidden_effect_is_named_with_its_parameters() -> None:

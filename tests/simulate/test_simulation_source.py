@@ -25,11 +25,9 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.commands import Command as MotionCommand
 from omnibench.simulate.commands import MotionGrid
-from omnibench.simulate.config import Truth
+from omnibench.simulate.config import RobotConfig, Truth
 from omnibench.simulate.motors import Motor, check_reach
-from omnibench.simulate.robot_config import RobotConfig
-from omnibench.simulate.simulation_request import simulate_like
-from omnibench.simulate.source import read_simulation, simulate_dataset
+from omnibench.simulate.source import read_simulation, simulate_dataset, simulate_like
 from omnibench.simulate.truth import Simulation, true_matrix
 from omnibench.testing import synthetic_robot, synthetic_trajectories
 

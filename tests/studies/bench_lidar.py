@@ -15,8 +15,7 @@ import pytest
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.floor_plan import PLANS, FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
-from omnibench.simulate.ray_casting import cast_rays
+from omnibench.simulate.lidar import Lidar, cast_rays, measure_scans, scan_stamps
 
 RUN = 6.5  # s
 RUNS = 190  # of 25 scans: about a session of 180 flower runs

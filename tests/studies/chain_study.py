@@ -18,7 +18,7 @@ from typing import Any
 
 from omnibench import discover_effects
 from omnibench.discover.result import Discovery
-from omnibench.simulate.robot_config import RobotConfig
+from omnibench.simulate.config import RobotConfig
 from omnibench.simulate.source import read_simulation, simulate_dataset
 from omnibench.slam.slam_dataset import slam_accuracy
 

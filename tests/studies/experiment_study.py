@@ -34,8 +34,7 @@ from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.processes import one_thread
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.config import FlowerConfig
-from omnibench.simulate.simulation_request import simulate_like
-from omnibench.simulate.source import simulate_dataset
+from omnibench.simulate.source import simulate_dataset, simulate_like
 from omnibench.slam.import_dataset import import_dataset
 
 SURE = 0.95  # weight of a sure name

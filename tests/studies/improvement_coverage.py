@@ -36,9 +36,9 @@ from scipy.special import stdtrit
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Split, Trajectory, make_dataset
-from omnibench.fit import ratio_intervals
+from omnibench.fit import intervals as ratio_intervals
 from omnibench.fit.calibrate import calibrate
-from omnibench.fit.ratio_intervals import Bootstrap, Interval, RatioIntervals, Units
+from omnibench.fit.intervals import Bootstrap, Clusters, Interval, RatioIntervals
 from omnibench.robot.kinematics import Array
 
 REPETITIONS = 5
@@ -75,7 +75,7 @@ class Errors:
 
     design: Array
     calibrated: Array
-    units: Units
+    units: Clusters
 
 
 def drawn(kind: Kind, commands: int, rng: np.random.Generator) -> Errors:
@@ -87,7 +87,7 @@ def drawn(kind: Kind, commands: int, rng: np.random.Generator) -> Errors:
     of_design = kind.design * rng.standard_normal((commands, 3))
     errors = shared[owner] + kind.run * rng.standard_normal((len(owner), 3))
     return Errors(
-        np.linalg.norm(errors + of_design[owner], axis=1), np.linalg.norm(errors, axis=1), Units("command", owner)
+        np.linalg.norm(errors + of_design[owner], axis=1), np.linalg.norm(errors, axis=1), Clusters("command", owner)
     )
 
 
@@ -107,7 +107,7 @@ def ours(errors: Errors, seed: int) -> Interval:
 def methods(errors: Errors, seed: int) -> dict[str, Interval]:
     """The interval that ships, and others."""
     units, rng = errors.units, np.random.default_rng(seed)
-    runs = replace(errors, units=Units("run", np.arange(len(errors.design))))
+    runs = replace(errors, units=Clusters("run", np.arange(len(errors.design))))
     after, before = units.sums(errors.calibrated), units.sums(errors.design)
     count, ratio = units.count, after.sum() / before.sum()
     chosen = rng.integers(count, size=(1000, count))

@@ -31,7 +31,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.ratio_intervals import Bootstrap, RatioIntervals, units_of
+from omnibench.fit.intervals import Bootstrap, RatioIntervals, units_of
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.import_dataset import import_dataset
 

@@ -209,7 +209,7 @@ class Base:
             slant = np.tan(self.rollers)
             by_x, by_y, by_turn = (self.rows(geometry) / (1 - geometry.losses) / radii[:, None]).T
             radii = np.hypot(1.0, slant) / np.hypot(by_x, by_y)
-            made = {f"distance_{n}": float(d) for n, d in zip(names, by_turn * radii, strict=True)}
+            made = {f"distance_{n}": float(abs(d)) for n, d in zip(names, by_turn * radii, strict=True)}
             axles = np.arctan2(by_y, by_x) - np.arctan2(1.0, slant)
             made |= {f"angle_{n}": float(a) for n, a in zip(names, axles, strict=True)}
             return made | {f"radius_{n}": float(r) for n, r in zip(names, radii, strict=True)}

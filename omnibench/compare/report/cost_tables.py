@@ -12,8 +12,8 @@ from omnibench.compare.config import PublishedResult
 from omnibench.compare.report import view as views
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.data.dataset import SPLITS, Split, Trajectory
+from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
-from omnibench.fit.ratio_intervals import Interval
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Details, Row, Section, Table
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span

@@ -14,7 +14,7 @@ from omnibench.compare.report import view as views
 from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.fit.ratio_intervals import Interval
+from omnibench.fit.intervals import Interval
 from omnibench.report import blocks
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
@@ -199,7 +199,7 @@ def _standing(view: views.DatasetView, best: EntryStatistics) -> str:
     if len(view.calibrated) == 1:
         return f"{best.label} is the only calibrator with an answer"
     if view.undecided:
-        return f"Which entry is best cannot be said ({view.units[view.scored].words})"
+        return f"Which entry is best cannot be said ({view.units[view.scored].ratio_words})"
     others = len(view.not_told_apart) - 1
     if not others:
         return f"{best.label} is best"
@@ -212,7 +212,7 @@ def _standing(view: views.DatasetView, best: EntryStatistics) -> str:
 
 def _standing_at_length(view: views.DatasetView, best: EntryStatistics) -> str:
     """The entries that are not told apart from the best one; of these the lowest training cost decides."""
-    basis = f"The intervals: {view.units[view.scored].words}."
+    basis = f"The intervals: {view.units[view.scored].ratio_words}."
     if len(view.calibrated) > 1 and view.undecided:
         return f"{best.label} has the lowest training cost. {basis}"
     rivals = [

@@ -12,7 +12,7 @@ from omnibench.compare.config import CompareConfig, PublishedResult
 from omnibench.compare.plan import UNBOUNDED
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.fit.evaluate import final_errors
-from omnibench.fit.ratio_intervals import Interval, Units, units_of
+from omnibench.fit.intervals import Clusters, Interval, units_of
 from omnibench.fit.reference_rows import measured_parts
 from omnibench.registry import calibrators, costs
 from omnibench.report.blocks import Cell, LegendItem
@@ -60,7 +60,7 @@ class DatasetView:
     styles: Mapping[str, LegendItem]
     design_costs: Mapping[Split, Interval]
     design_errors: Mapping[Split, Array]
-    units: Mapping[Split, Units]
+    units: Mapping[Split, Clusters]
     held_out: results.EntryVerdict | None
     sessions: tuple[str, ...]
 
@@ -234,7 +234,7 @@ def improvement_in_words(entry: results.EntryStatistics, split: Split, decimals:
 
 def interval_basis(view: DatasetView, split: Split) -> str:
     """The basis of a split's intervals, in words: ``bootstrap over 36 commands``."""
-    return view.units[split].words
+    return view.units[split].ratio_words
 
 
 def interval_in_words(interval: Interval | None, decimals: int) -> str:

@@ -37,47 +37,38 @@ def write_template(folder: Path, robot_type: str, *, references: bool = False) -
     rng = np.random.default_rng(0)
     files = {folder / "robot.yaml": text}
     runs, measured = ["run,command,repetition"], ["run,kind,value,value_x,value_y,sigma"]
-    for command, twist in (_measured_commands(robot) if references else _COMMANDS).items():
+    model, steered = OdometryModel.of_design(robot, "arc"), robot.drive.steered
+    names = [*(f"omega_{wheel}" for wheel in robot.wheel_names), *(f"steer_{wheel}" for wheel in steered)]
+    commands = _COMMANDS
+    if references:  # which are told best along straights and on the spot
+        sideways = not steered and np.linalg.matrix_rank(robot.inverse_kinematic_matrix) == len(_NOISE)
+        commands = {"straight": _COMMANDS["straight"], **_BACK, **(_SIDEWAYS if sideways else {})}
+        commands |= {command: _COMMANDS[command] if steered else spin for command, spin in _SPINS.items()}
+    for command, twist in commands.items():
         for repetition in (1, 2):
             run = f"{command}_{repetition}"
             runs.append(f"{run},{command},{repetition}")
             log = _log(robot, np.array(twist))
-            names = [f"omega_{wheel}" for wheel in robot.wheel_names] + [
-                f"steer_{wheel}" for wheel in robot.drive.steered
-            ]
             columns = log.rates if log.steering is None else np.hstack([log.rates, log.steering])
             files[folder / f"{run}_wheels.csv"] = _csv(["t", *names], log.times, columns)
-            if references:
-                measured.append(f"{run},{_measured(robot, log, command, rng)}")
-            else:
-                (poses,) = OdometryModel.of_design(robot, "arc").poses([log])
+            (poses,) = model.poses([log])
+            if not references:
                 shown = poses + rng.normal(0.0, _NOISE, poses.shape)
                 files[folder / f"{run}_poses.csv"] = _csv(["t", "x", "y", "theta"], log.stamps, shown)
+            elif command in _SPINS:
+                measured.append(f"{run},turn,{poses[-1, 2] + rng.normal(0.0, _BY_MARK):.4f},,,{_BY_MARK}")
+            elif command in _SIDEWAYS:
+                x, y = poses[-1, :2] + rng.normal(0.0, _BY_TAPE, 2)
+                measured.append(f"{run},displacement,,{x:.4f},{y:.4f},{_BY_TAPE}")
+            else:
+                distance = np.hypot(*poses[-1, :2]) + rng.normal(0.0, _BY_TAPE)
+                measured.append(f"{run},distance,{distance:.4f},,,{_BY_TAPE}")
     if references:
         files[folder / "references.csv"] = "\n".join(measured) + "\n"
     files[folder / "runs.csv"] = "\n".join(runs) + "\n"
     for file, content in files.items():
         write_text(file, content)
     return list(files)
-
-
-def _measured_commands(robot: Robot) -> dict[str, tuple[float, float, float]]:
-    """Commands whose ends a tape and marks on the floor can tell: turns on the spot, where a robot need not steer."""
-    turns = {command: _COMMANDS[command] if robot.drive.steered else spin for command, spin in _SPINS.items()}
-    sideways = _SIDEWAYS if np.linalg.matrix_rank(robot.inverse_kinematic_matrix) == len(_NOISE) else {}
-    return {"straight": _COMMANDS["straight"], **_BACK, **({} if robot.drive.steered else sideways), **turns}
-
-
-def _measured(robot: Robot, log: WheelLog, command: str, rng: np.random.Generator) -> str:
-    """The row of what is measured of a run, after its name: kind, value, value_x, value_y and sigma."""
-    (poses,) = OdometryModel.of_design(robot, "arc").poses([log])
-    x, y, turned = poses[-1]
-    if command in _SPINS:
-        return f"turn,{turned + rng.normal(0.0, _BY_MARK):.4f},,,{_BY_MARK}"
-    if command in _SIDEWAYS:
-        x, y = poses[-1, :2] + rng.normal(0.0, _BY_TAPE, 2)
-        return f"displacement,,{x:.4f},{y:.4f},{_BY_TAPE}"
-    return f"distance,{np.hypot(x, y) + rng.normal(0.0, _BY_TAPE):.4f},,,{_BY_TAPE}"
 
 
 def _log(robot: Robot, twist: Array) -> WheelLog:

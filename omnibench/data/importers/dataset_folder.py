@@ -137,18 +137,14 @@ def recordings_of(
         covariances = None if run.pose_covariances is None else run.pose_covariances[:, poses][:, :, poses]
         seen = PoseReadings(run.pose_times, run.poses[:, poses], covariances) if run.start_known else None
         measured = None if run.references is None else run.references.open_ended(float(run.times[-1]))
-        said = {key: getattr(run, key) for key in ("command", "repetition", "split", "session", "started_at")}
+        known = {key: getattr(run, key) for key in ("command", "repetition", "split", "session", "started_at")}
         numbers = {key: getattr(run, key) for key in ("v", "alpha", "omega", "duration", "distance")}
-        numbers = {key: value for key, value in numbers.items() if value is not None}
         sent = None if run.sent is None else run.sent * (second, 1, 1, 1, second)
-        attributes = RunAttributes(**said, numbers=numbers, sent=sent)
-        seeing = None
+        said, seeing = RunAttributes(**known, numbers=numbers, sent=sent), None
         if scans is not None and run.id in scanned:
             seeing = ScanReadings(scans.scanner, run.id, scans.times(run.id), partial(_ranges, scans, run.id))
         place = f"trajectory {run.id}"
-        recordings.append(
-            Recording(run.id, place, readings, seen, measured, attributes=attributes, scans=seeing, a_run=True)
-        )
+        recordings.append(Recording(run.id, place, readings, seen, measured, attributes=said, scans=seeing, a_run=True))
     return recordings
 
 
@@ -166,3 +162,26 @@ def _chosen(names: Sequence[str], known: Sequence[str], prefix: str, option: str
     if len(set(bare)) < len(bare):
         raise ConfigError(f"{option} names one wheel twice: {', '.join(names)}; name each once")
     return {known.index(name): name for name in bare}
+
+
+def importer_of(name: str, source: Path, options: Mapping[str, Any]) -> tuple[Importer, dict[str, Any]]:
+    """The importer called ``name`` with its options, completed by the source; and the options that it does not have.
+
+    These are options of ``import dataset``, as if the data set that it gives was imported again. UnknownNameError,
+    ConfigError or DataError in one line.
+    """
+    entry = importers.entry(name)
+    others = DatasetOptions.model_fields.keys() - entry.options.model_fields.keys()
+    again = {key: value for key, value in options.items() if key in others}
+    own = {key: value for key, value in options.items() if key not in again}
+    importer: Importer = importers.create(name, entry.cls.completed(own, source))
+    return importer, again
+
+
+def read_dataset(importer: Importer, source: Path, again: Mapping[str, Any]) -> Dataset:
+    """The data set of a source, read again by options that its importer does not have.
+
+    Its poses are placeholders where they must be made of scans. ConfigError or DataError in one line.
+    """
+    dataset = importer.read(source)
+    return read_again(dataset, again, f"importer {importer.name!r}") if again else dataset

@@ -11,17 +11,19 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 from pydantic import Field
 
+from omnibench.config import Model, read_yaml
 from omnibench.data.clock_matching import usual_period
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.delimited import read_numbers
@@ -33,21 +35,21 @@ from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
 from omnibench.words import plural
 
+RobotType = Literal["diff", "omni3", "omni4", "tricyc"]
+_SOURCE = "public GitHub repository sousarbarb/optiodom, commit 8e025fd7"
+_RUN = re.compile(r"_run-(\d+)\.csv$")
+_POSE = ("t", "x", "y", "theta")
+_SAME_SPEED = 0.02  # m/s, rad/s: commands below are standstill
+_SAME_TICKS = 1e-6  # logs of turns are rounded to some digits
 
-@dataclass(frozen=True)
-class Kind:
-    """A robot, and the columns of its files, counted from 0.
 
-    lengths: how many the metadata state, L, or L1 and L2. wheels: as in dataset.yaml, without radii, with x, y and
-    distances in these lengths. columns: of its run files after t, x, y, theta; ticks first. signs: of these, to the
-    wheels' sense in omnibench. log_fields: of a row of its log, whose first is the time. log_ticks, log_signs: as in
-    the run files. log_commands: v, vn (if any) and omega; in ticks and rad a cycle, not in m/s and rad/s, where there
-    is no vn. Empty: they are not logged.
-    """
+class Kind(Model):
+    """A robot, and the columns of its files; ``optiodom.yaml`` says what each means."""
 
     title: str
+    description: str
     lengths: int
-    wheels: tuple[Mapping[str, Any], ...]
+    wheels: tuple[dict[str, Any], ...]
     columns: tuple[str, ...]
     signs: tuple[int, ...]
     log_fields: int
@@ -55,117 +57,80 @@ class Kind:
     log_signs: tuple[int, ...]
     log_commands: tuple[int, ...] = ()
 
-
-KINDS = {
-    "diff": Kind(
-        "differential drive, encoders at 20 Hz", 1,
-        ({"name": "right", "type": "fixed", "x": 0, "y": -0.5}, {"name": "left", "type": "fixed", "x": 0, "y": 0.5}),
-        ("ticks_right", "ticks_left"), (1, 1), 8, (2, 1), (1, 1), (6, 7),
-    ),
-    "omni3": Kind(
-        "three-wheeled omnidirectional robot, encoders at 25 Hz", 1,
-        tuple({"name": name, "distance": 1, "angle_deg": angle, "roller_angle": 0}
-              for name, angle in (("0", 300), ("1", 60), ("2", 180))),
-        ("ticks_0", "ticks_1", "ticks_2"), (-1, -1, -1), 10, (1, 2, 3), (1, 1, 1), (7, 8, 9),
-    ),
-    "omni4": Kind(
-        "mecanum base, encoders at 100 Hz", 2,
-        ({"name": "front_left", "type": "mecanum", "x": 0.5, "y": 0.5, "roller_angle_deg": 45},
-         {"name": "front_right", "type": "mecanum", "x": 0.5, "y": -0.5, "roller_angle_deg": -45},
-         {"name": "rear_left", "type": "mecanum", "x": -0.5, "y": 0.5, "roller_angle_deg": -45},
-         {"name": "rear_right", "type": "mecanum", "x": -0.5, "y": -0.5, "roller_angle_deg": 45}),
-        ("turns_0", "turns_1", "turns_2", "turns_3"), (1, -1, 1, -1), 11, (1, 2, 3, 4), (-1, 1, -1, 1), (8, 9, 10),
-    ),
-    "tricyc": Kind(  # neither the radius of its rear wheels nor their distance apart counts
-        "tricycle with a driven and steered front wheel, encoders at 20 Hz", 1,
-        ({"name": "front", "type": "steered", "x": 1, "y": 0},
-         {"name": "rear_left", "type": "fixed", "x": 0, "y": 0.5, "measured": False},
-         {"name": "rear_right", "type": "fixed", "x": 0, "y": -0.5, "measured": False}),
-        ("ticks", "steering"), (1,), 3, (1,), (1,),
-    ),
-}  # fmt: skip
-"""The robots by their type in the metadata."""
-
-
-class Geometry(NamedTuple):
-    """Design values by a session's metadata, m. lengths: L, or L1 and L2. diameters: of the wheels."""
-
-    lengths: tuple[float, ...]
-    diameters: tuple[float, ...]
-
-    def __str__(self) -> str:
-        lengths, diameters = (
-            ", ".join(f"{value:g}" for value in (values[:1] if len(set(values)) == 1 else values)) for values in self
-        )
-        return f"L {lengths} m, D {diameters} m"
-
-    def robot(self, kind: str, name: str) -> Robot:
-        """The robot of some type. Of a tricycle, whose metadata state one diameter, all wheels have this."""
-        scales = {"x": self.lengths[0], "y": self.lengths[-1], "distance": self.lengths[0]}
-        wheels = [
-            {key: value * scales[key] if key in scales else value for key, value in wheel.items()}
-            | {"radius": diameter / 2}
-            for wheel, diameter in zip(KINDS[kind].wheels, cycle(self.diameters), strict=False)
-        ]
+    def robot(self, lengths: Sequence[float], diameters: Sequence[float], name: str) -> Robot:
+        """The robot of these dimensions, m. Of a tricycle, whose metadata state one diameter, all wheels have this."""
+        scales = {"x": lengths[0], "y": lengths[-1], "distance": lengths[0]}
+        wheels = []
+        for wheel, diameter in zip(self.wheels, cycle(diameters), strict=False):
+            scaled = {key: wheel[key] * scale for key, scale in scales.items() if key in wheel}
+            wheels.append({**wheel, **scaled, "radius": diameter / 2})
         return Robot.model_validate({"name": name, "wheels": wheels})
 
 
-_RUN = re.compile(r"_run-(\d+)\.csv$")
+@cache
+def kinds() -> dict[str, Kind]:
+    """The robots by their type in the metadata."""
+    content = read_yaml(Path(__file__).with_suffix(".yaml"))
+    return {name: Kind(**kind, description=content["description"]) for name, kind in content["robots"].items()}
 
 
 @dataclass(frozen=True)
 class Session:
     """Content of ``<session>_metadata.csv``, and the run files beside it by their numbers.
 
-    robot: its type. angle_per_tick: of a wheel, rad. starts: when each run's file begins in the session's log, s after
-    the run's begin there.
+    robot: its type. lengths, diameters: design values, m: L, or L1 and L2; of the wheels. angle_per_tick: of a wheel,
+    rad. starts: when each run's file begins in the session's log, s after the run's begin there.
     """
 
     file: Path
-    group: str
     name: str
     robot: str
-    geometry: Geometry
+    lengths: tuple[float, ...]
+    diameters: tuple[float, ...]
     angle_per_tick: float
     starts: tuple[float, ...]
     runs: dict[int, Path]
+
+    @property
+    def group(self) -> str:
+        """The name of the folder that holds session folders."""
+        return self.file.parent.parent.name
+
+    @property
+    def dimensions(self) -> str:
+        """The design values in words; those that are all the same once."""
+        shown = [values[:1] if len(set(values)) == 1 else values for values in (self.lengths, self.diameters)]
+        lengths, diameters = (", ".join(f"{value:g}" for value in values) for values in shown)
+        return f"L {lengths} m, D {diameters} m"
 
 
 def read_metadata(file: Path) -> Session:
     """Read a session's metadata and find its runs. DataError names the file and the key that is wrong."""
     rows = csv.reader(read_text(file).splitlines())
-    values = {key.strip(): [text.strip() for text in texts if text.strip()] for key, *texts in filter(None, rows)}
+    values = {key.strip(): [cell.strip() for cell in cells if cell.strip()] for key, *cells in filter(None, rows)}
     robot = "".join(values.get("type", [])[:1])
-    if robot not in KINDS:
-        raise DataError(f"{file}: type is {robot!r}; {nearest(robot, KINDS)}it must be one of {', '.join(KINDS)}")
-    numbers: dict[str, tuple[float, ...]] = {"odo_ti": ()}
-    counts = {"Di": len(KINDS[robot].signs), "Li": KINDS[robot].lengths, "ngear": 1, "encRes": 1}
-    optional = {"odo_ti": len(values["odo_ti"])} if "odo_ti" in values else {}
-    for key, count in (counts | optional).items():
-        if key not in values:
+    if (kind := kinds().get(robot)) is None:
+        raise DataError(f"{file}: type is {robot!r}; {nearest(robot, kinds())}it must be one of {', '.join(kinds())}")
+    numbers: dict[str, tuple[float, ...]] = {}
+    texts = {"odo_ti": [], **values}
+    counts = {"Di": len(kind.signs), "Li": kind.lengths, "ngear": 1, "encRes": 1, "odo_ti": len(texts["odo_ti"])}
+    for key, count in counts.items():
+        if key not in texts:
             raise DataError(f"{file}: key {key!r} is missing; {nearest(key, values)}found: {', '.join(values)}")
-        numbers[key] = _numbers(values[key])
-        if len(numbers[key]) != count:
-            raise DataError(f"{file}: {key} is {', '.join(values[key])!r}, expected {count} numbers")
-        if key in counts and min(numbers[key]) <= 0:
-            raise DataError(f"{file}: {key} is {min(numbers[key]):g}, it must be above 0")
+        try:
+            numbers[key] = tuple(map(float, texts[key]))
+        except ValueError:
+            numbers[key] = ()
+        least = -math.inf if key == "odo_ti" else 0.0
+        if len(numbers[key]) != count or not all(least < number < math.inf for number in numbers[key]):
+            raise DataError(f"{file}: {key} is {', '.join(texts[key])}, expected {count} numbers above 0")
     name = file.name.removesuffix("_metadata.csv")
     files = sorted(file.parent.glob(f"{name}_run-*.csv"))
     runs = {int(match[1]): path for path in files if (match := _RUN.search(path.name))}
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
     tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
-    geometry = Geometry(numbers["Li"], numbers["Di"])
-    return Session(file, file.parent.parent.name, name, robot, geometry, tick, numbers["odo_ti"], runs)
-
-
-def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
-    """Texts as numbers; empty if one is not a finite number."""
-    try:
-        numbers = tuple(map(float, texts))
-    except ValueError:
-        return ()
-    return numbers if all(map(math.isfinite, numbers)) else ()
+    return Session(file, name, robot, numbers["Li"], numbers["Di"], tick, numbers["odo_ti"], runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +138,7 @@ class SessionLog:
     """The robot's own log of a session. path: its size, in a name's words. runs (F,): number of the run of each row.
 
     times (F,): s. ticks, angles (F, N): of the wheels, and rad, in omnibench's sense. commands (F, 3): twists, m/s,
-    m/s, rad/s, or None.
+    m/s, rad/s, or (F, 0): they are not logged.
     """
 
     file: Path
@@ -182,12 +147,12 @@ class SessionLog:
     times: Array
     ticks: Array
     angles: Array
-    commands: Array | None
+    commands: Array
 
 
 def read_log(session: Session) -> SessionLog | None:
     """The session's log, if it is there. DataError names the file and the line that is wrong."""
-    file, kind = session.file.with_name(f"{session.name}.csv"), KINDS[session.robot]
+    file, kind = session.file.with_name(f"{session.name}.csv"), kinds()[session.robot]
     if not file.is_file():
         return None
     text, line, run = pl.col("text"), pl.col("line"), pl.col("run")
@@ -209,16 +174,13 @@ def read_log(session: Session) -> SessionLog | None:
     for row in rows["line"].filter(~np.isfinite(table).all(axis=1)).head(1):
         raise DataError(f"{file}, line {row}: expected {count} finite numbers; repair the row")
     header = [row.split(",") for row in lines.filter((run < 0) & (line < rows["line"][0]))["text"]]
-    runs = rows["run"].to_numpy().astype(np.intp)
-    times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, None
-    if len(kind.log_commands) == 3:
-        commands = table[:, kind.log_commands]
-    elif kind.log_commands:
-        metres = session.angle_per_tick * float(np.mean(session.geometry.diameters)) / 2
-        speed, turn = table[:, kind.log_commands].T
+    times, ticks, commands = table[:, 0], table[:, kind.log_ticks] * kind.log_signs, table[:, kind.log_commands]
+    if len(kind.log_commands) == 2:
+        metres = session.angle_per_tick * float(np.mean(session.diameters)) / 2
+        speed, turn = commands.T
         commands = np.column_stack([speed * metres, np.zeros(len(table)), turn]) / float(np.median(np.diff(times)))
     angles = np.cumsum(ticks, axis=0) * session.angle_per_tick
-    return SessionLog(file, _path(header), runs, times, ticks, angles, commands)
+    return SessionLog(file, _path(header), rows["run"].to_numpy().astype(np.intp), times, ticks, angles, commands)
 
 
 def _path(header: Sequence[Sequence[str]]) -> str:
@@ -241,30 +203,16 @@ def _path(header: Sequence[Sequence[str]]) -> str:
     return size
 
 
-_POSE = ("t", "x", "y", "theta")
-_SAME_SPEED = 0.02  # m/s, rad/s: commands below are standstill
-_SAME_TICKS = 1e-6  # logs of turns are rounded to some digits
-_DESCRIPTION = (
-    "INESC TEC {} and OptiTrack; Sousa, Petry, Costa, Moreira: "
-    "OptiOdom, J. Intell. Robot. Syst. 105:39 (2022), doi 10.1007/s10846-022-01630-3. Encoders and OptiTrack were "
-    "synchronised by hand, run by run: offsets up to 0.2 s and a drift of about 0.1 s a minute remain."
-)
-
-
 class OptiodomOptions(Options):
     """Choice of groups that train and validate. A group is the folder that holds session folders: circular, square."""
 
-    robot: Literal["diff", "omni3", "omni4", "tricyc"] | None = Field(
-        None, description="the robot to import where the source holds several; its sessions' metadata say their type"
-    )
+    robot: RobotType | None = Field(None, description="the one to import where the source holds several")
     train: Names = Field((), description="groups that train; default: the first by name")
     validation: Names = Field((), description="groups that validate; default: all others")
     log: bool = Field(True, description="read commands and absolute wheel angles from each session's own log")
     name: str = Field("optiodom", min_length=1, description="name of the data set")
     robot_name: str | None = Field(None, min_length=1, description="default: inesc_tec_ and its type")
-    source: str = Field(
-        "public GitHub repository sousarbarb/optiodom, commit 8e025fd7", description="origin of the recording"
-    )
+    source: str = Field(_SOURCE, description="origin of the recording")
 
 
 @importers.register("optiodom")
@@ -302,25 +250,22 @@ class Optiodom(Importer):
         sessions = [read_metadata(file) for file in sorted(source.resolve().rglob("*_metadata.csv"))]
         if not sessions:
             raise DataError(f"{source}: no *_metadata.csv below it; name a folder with OptiOdom sessions (data/omni3)")
-        kinds = sorted({session.robot for session in sessions})
-        kind = options.robot or kinds[0]
-        if options.robot is None and len(kinds) > 1:
-            raise DataError(
-                f"{source}: it holds recordings of {plural(len(kinds), 'robot')}, {', '.join(kinds)}; import one at a "
-                f"time: name its folder, or --set robot={kind}"
-            )
-        if kind not in kinds:
-            raise DataError(f"{source}: it holds no recordings of robot {kind}; found: {', '.join(kinds)}")
-        sessions = [session for session in sessions if session.robot == kind]
-        # The commonest geometry, of equally common ones the first session's; and a note if there are others.
-        (geometry, most), *others = Counter(session.geometry for session in sessions).most_common()
+        robots = sorted({session.robot for session in sessions})
+        robot, found = options.robot or robots[0], ", ".join(robots)
+        if options.robot is None and len(robots) > 1:
+            way = f"import one at a time: name its folder, or --set robot={robot}"
+            raise DataError(f"{source}: it holds recordings of {plural(len(robots), 'robot')}, {found}; {way}")
+        if robot not in robots:
+            raise DataError(f"{source}: it holds no recordings of robot {robot}; found: {found}")
+        sessions = [session for session in sessions if session.robot == robot]
+        # The commonest dimensions, of equally common ones the first session's; and a note if there are others.
+        (common, most), *others = Counter((each.lengths, each.diameters) for each in sessions).most_common()
+        said = {(each.lengths, each.diameters): each.dimensions for each in sessions}
         notes = []
         if others:
-            rest = "; ".join(f"{other} in {count}" for other, count in others)
-            notes.append(
-                f"sessions state different dimensions of the robot: those of {most} of {len(sessions)} are taken, "
-                f"{geometry} (others: {rest})"
-            )
+            rest = "; ".join(f"{said[other]} in {count}" for other, count in others)
+            taken = f"those of {most} of {len(sessions)} are taken, {said[common]} (others: {rest})"
+            notes.append(f"sessions state different dimensions of the robot: {taken}")
         runs, groups, unlogged = list[Trajectory](), list[str](), list[str]()
         for session in sessions:
             log = read_log(session) if options.log else None
@@ -328,20 +273,19 @@ class Optiodom(Importer):
             runs += [_read_run(session, number, log, options.log) for number in session.runs]
             groups += [session.group] * len(session.runs)
         if unlogged:
-            notes.append(
-                f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)}): commands "
-                "are named after the motion by the wheels there, and absolute wheel angles are left out of all runs"
-            )
+            without = f"{len(unlogged)} of {plural(len(sessions), 'session')} have no log ({', '.join(unlogged)})"
+            instead = "commands are named after the motion by the wheels there, and absolute wheel angles are left out"
+            notes.append(f"{without}: {instead} of all runs")
         train = options.train
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
-        said = (f"{note[:1].upper()}{note[1:]}." for note in notes)
+        kind, sentences = kinds()[robot], (f"{note[:1].upper()}{note[1:]}." for note in notes)
         dataset = make_dataset(
             options.name,
-            geometry.robot(kind, options.robot_name or f"inesc_tec_{kind}"),
+            kind.robot(*common, options.robot_name or f"inesc_tec_{robot}"),
             usual_period([run.pose_times for run in runs]),
             divided(complete(runs), train, options.validation, "group", names=groups),
-            description=" ".join([_DESCRIPTION.format(KINDS[kind].title), *said]),
+            description=" ".join([kind.description.format(kind.title), *sentences]),
             source=options.source,
             licence="MIT",
         )
@@ -363,7 +307,7 @@ def _motion(twists: Array, durations: Array) -> dict[str, Any]:
 def _read_run(session: Session, number: int, log: SessionLog | None, with_log: bool) -> Trajectory:
     """A run; unless logs are left out, with the name of its command: what was sent to the robot, as far as the log has
     it, and what the robot made of that by the odometry by which it drove."""
-    kind = KINDS[session.robot]
+    kind = kinds()[session.robot]
     table = read_numbers(session.runs[number], (*_POSE, *kind.columns), header_lines=0)
     if len(table) < 2:
         raise DataError(f"{table.file}: a run needs two rows or more")
@@ -379,7 +323,7 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
     )
     if not with_log:
         return run
-    robot = session.geometry.robot(session.robot, session.robot)
+    robot = kind.robot(session.lengths, session.diameters, session.robot)
     middle = None if steering is None else in_the_middle(steering)
     driven = robot.drive.signals(rates, middle) @ robot.inverse_kinematic_matrix.T
     motion, turned, speed = _motion(driven, steps), math.degrees(float(driven[:, 2] @ steps)), ""
@@ -389,12 +333,10 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
         first = round(start / float(np.median(steps)))
         rows = np.flatnonzero(log.runs == number)[first : first + len(ticks)]
         if len(rows) < len(ticks) or not np.allclose(log.ticks[rows], ticks, rtol=0, atol=_SAME_TICKS):
-            raise DataError(
-                f"{log.file}: does not hold the ticks of {table.file.name}; import with log: false to do without"
-            )
+            raise DataError(f"{log.file}: does not hold the ticks of {table.file.name}; do without it by log: false")
         logged = log.times[rows]
         run = replace(run, angles=log.angles[rows[1:]], started_at=float(logged[0] - log.times[0]))
-        if log.commands is not None:
+        if log.commands.size:
             sent = log.commands[rows]
             motion, speed = _motion(sent, np.diff(logged, prepend=logged[0])), f"_v{np.hypot(*sent[:, :2].T).max():.2g}"
             run, alpha = replace(run, **motion), motion["alpha"]

@@ -32,7 +32,7 @@ from omnibench.data.scans import Scanner
 from omnibench.data.splits import every_second, repetitions
 from omnibench.errors import DataError
 from omnibench.registry import importers
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
 _COMMAND = ("v", "alpha", "omega", "d")
@@ -40,13 +40,11 @@ _POSE = ("x", "y", "theta")
 _SENT = ("v", "alpha", "omega", "t_r")
 _WAY_OUT = "set scanner={rays: 1080, angle_min: -2.356, ..., mount: {x: 0.1, y: 0, yaw: 0}} (m, rad)"
 
-APR_02 = Robot(
-    name="APR-02",
-    wheels=tuple(
-        Wheel(name=name, radius=0.148, distance=0.195, angle=math.radians(angle), roller_angle=0.0)
-        for name, angle in (("a", 60), ("b", 180), ("c", 300))
-    ),
-)
+_WHEELS = [
+    {"name": name, "radius": 0.148, "distance": 0.195, "angle_deg": angle}
+    for name, angle in (("a", 60), ("b", 180), ("c", 300))
+]
+APR_02 = Robot.model_validate({"name": "APR-02", "wheels": _WHEELS})
 """The design values behind Eq. (7)."""
 
 UTM_30LX = Scanner(
@@ -106,19 +104,19 @@ class Table1(Importer):
 
     def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
         """The trajectories under ``source`` as they stand in their tables."""
+        options = self.options
         folders = [file.parent for file in sorted(source.rglob("command.csv"))]
         if not folders:
-            what = "no command.csv below it; Table 1 wants one folder a trajectory with command.csv"
-            raise DataError(f"{source}: {what}")
-        recordings = [_recording(folder, source, self.options) for folder in folders]
-        if self.options.scanner == UTM_30LX and any(recording.scans for recording in recordings):
+            raise DataError(f"{source}: no command.csv below it; each trajectory is a folder with one")
+        recordings = [_recording(folder, source, options) for folder in folders]
+        if options.scanner == UTM_30LX and any(recording.scans for recording in recordings):
             unknown = "lidar.csv does not say where the LIDAR is mounted; the robot's middle is taken"
             notes.append(f"{source}: {unknown}; {_WAY_OUT}")
         # Splits by folders called train and validation, else every second repetition validates.
         attributes = [recording.attributes for recording in recordings]
         alike = [(said.session, said.command) for said in attributes]
         splits: list[Split | None] = [said.split for said in attributes]
-        if not any(splits) or self.options.train or self.options.validation:
+        if not any(splits) or options.train or options.validation:
             splits = list(every_second(alike))
         if None in splits:
             stray = recordings[splits.index(None)].name
@@ -134,8 +132,7 @@ def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
     wheels, targets = ([f"omega_{prefix}{wheel}" for wheel in options.robot.wheel_names] for prefix in ("", "M"))
     table = read_numbers(folder / "command.csv", _COMMAND)
     if len(table) != 1:
-        rows = plural(len(table), "row")
-        raise DataError(f"{table.file}: it has {rows}, expected one: the command of this trajectory")
+        raise DataError(f"{table.file}: it has {plural(len(table), 'row')}, expected one: the trajectory's command")
     v, alpha, omega, distance = table.columns(_COMMAND)[0].tolist()
     times, rates = _timed(folder / "wheels.csv", wheels)
     pose_times, poses = _timed(folder / "slam.csv", _POSE)
@@ -154,13 +151,10 @@ def _recording(folder: Path, source: Path, options: Table1Options) -> Recording:
         sent = np.column_stack(_timed(file, _SENT)) * (1, 1, RADIANS["deg"], 1, 1)
     if (file := folder / "lidar.csv").exists():
         scans = _scans(file, options.scanner, float(pose_times[0]), float(times[-1]))
-    attributes = RunAttributes(
-        f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}",
-        split=next((split for split in SPLITS if split in name.split("/")), None),
-        session=name.rpartition("/")[0] or None,
-        numbers={"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance},
-        sent=sent,
-    )
+    command, session = f"v{v:g}_a{alpha:g}_w{omega:g}_d{distance:g}", name.rpartition("/")[0] or None
+    split = next((split for split in SPLITS if split in name.split("/")), None)
+    numbers = {"v": v, "alpha": math.radians(alpha), "omega": omega, "distance": distance}
+    attributes = RunAttributes(command, split=split, session=session, numbers=numbers, sent=sent)
     readings = WheelReadings(times, rates, options.wheel_unit, begin=0.0, others=others)
     place = str(folder / "slam.csv")
     return Recording(name, place, readings, PoseReadings(pose_times, poses), attributes=attributes, scans=scans)

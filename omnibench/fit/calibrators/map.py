@@ -1,7 +1,7 @@
 """Maximum a posteriori: the most probable matrix and lost wheel rate, by all references and the robot's design.
 
 What it minimises stands in fit/estimate.py, what is known of a design in fit/prior.py, and its intervals in
-fit/jackknife.py. Beside the matrix stands one effect that all robots here have in common, the rate that every turning
+fit/intervals.py. Beside the matrix stands one effect that all robots here have in common, the rate that every turning
 wheel loses or gains (``wheel_dead_zone``): rollers creep, tyres slip in turns.
 """
 
@@ -26,7 +26,7 @@ from omnibench.fit.estimate import (
     estimate,
     estimate_with_steering,
 )
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.motion_windows import windows_of
 from omnibench.fit.prior import default_mount, physical_prior_root, physical_tolerance
@@ -118,7 +118,7 @@ class Map(Calibrator):
             found = estimate(of_runs, may_go_on)
         clusters = Clusters.of(runs)
         unit = np.eye(found.root.shape[1])
-        covariance = jackknife(found.information, found.scores, clusters, unit).of(found.root)
+        covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
         end = f"{'' if found.at_rest else 'not '}at rest after {found.steps} steps"
         extension, size = None, found.matrix.size
         if found.terms:

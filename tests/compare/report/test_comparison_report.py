@@ -36,8 +36,8 @@ from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.importers.table1 import APR_02
 from omnibench.data.storage import load_dataset, save_dataset
+from omnibench.fit.intervals import Interval
 from omnibench.fit.problem import Improvement
-from omnibench.fit.ratio_intervals import Interval
 from omnibench.report.blocks import Callout, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import motion_system, parameters
 from omnibench.report.numbers import fixed

@@ -203,7 +203,7 @@ MOTIVE = (
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("wheels", ROSTOPIC, "omega_left: field.position1, omega_right: field.position0, t: '%time'}"),
+        ("wheels", ROSTOPIC, "t: '%time', omega_left: field.position1, .*unit=rad --set wheel_time_unit=ns"),
         ("poses", MOTIVE, "are there 4 lines above the rows[?] --set pose_header_lines=4"),
         ("poses", MOTIVE.split("\n", 3)[3], "columns={pose_t: 2, qx: 3, qy: 4, qz: 5, qw: 6, x: 7, z: 9}.* --set up=y"),
     ],

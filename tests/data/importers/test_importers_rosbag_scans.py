@@ -49,7 +49,7 @@ from scan_samples import (
 )
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.importers.bag_sensors import east_north
+from omnibench.data.importers.rosbag import east_north
 from omnibench.data.scans import Mount
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError

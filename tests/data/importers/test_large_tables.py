@@ -13,7 +13,6 @@ import pytest
 from drive_samples import DIFF, drive
 
 import omnibench.data.delimited as delimited
-import omnibench.data.importers.csv as csv_importer
 from omnibench.data.dataset import Dataset
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError
@@ -51,8 +50,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def streamed(monkeypatch: pytest.MonkeyPatch, source: Path, options: dict[str, Any]) -> Dataset:
-    for module in (delimited, csv_importer):
-        monkeypatch.setattr(module, "LARGE", 0)
+    monkeypatch.setattr(delimited, "LARGE", 0)
     return import_dataset("csv", source, {"robot": DIFF} | options)
 
 

@@ -12,8 +12,8 @@ from sample_robots import APR_02, WHEELED
 
 from omnibench.data import counters
 from omnibench.data.dataset import Trajectory, make_dataset
-from omnibench.data.importers.copied_reference import follows_the_wheels
 from omnibench.data.importers.tum import planar_headings, read_tum, write_tum
+from omnibench.data.spoiled_references import follows_the_wheels
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array, CarDrive, Robot
 

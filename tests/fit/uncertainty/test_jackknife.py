@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from motions import FLOWER, driven
 
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.jackknife import Clusters, jackknife
+from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.uncertainty import sum_of_norms, uncertainty_of
 from omnibench.registry import calibrators, costs
 from omnibench.robot.kinematics import Array
@@ -27,19 +27,19 @@ def clusters_of(keys: Sequence[tuple[str | None, str | None]]) -> Clusters:
 
 def test_three_sessions_are_the_clusters() -> None:
     found = clusters_of([(name, "go") for name in "aabcb"])
-    assert (found.name, found.members) == ("session", ((0, 1), (2, 4), (3,)))
+    assert (found.name, found.of_run.tolist()) == ("session", [0, 0, 1, 2, 1])
     assert found.words == "jackknife over 3 sessions"
 
 
 def test_commands_are_the_clusters_where_runs_repeat_some_and_sessions_are_two() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("b", "go"), ("b", None)])
-    assert (found.name, found.members) == ("command", ((0, 2), (1,), (3,)))
+    assert (found.name, found.of_run.tolist()) == ("command", [0, 1, 0, 2])
     assert found.words == "jackknife over 3 commands"
 
 
 def test_runs_are_the_clusters_where_no_command_is_repeated() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("a", None)])
-    assert (found.name, len(found.members)) == ("run", 3)
+    assert (found.name, found.count) == ("run", 3)
     assert found.words == "jackknife over 3 runs, of one session alone"
 
 
@@ -52,7 +52,7 @@ def test_a_single_run_has_the_curvature_and_it_is_said() -> None:
 
 
 def each_alone(count: int) -> Clusters:
-    return Clusters("run", tuple((number,) for number in range(count)), 1)
+    return Clusters("run", np.arange(count))
 
 
 def least_squares(columns: Array, values: Array) -> Array:
@@ -74,7 +74,29 @@ def test_of_linear_least_squares_it_is_the_scatter_of_refits_without_each_cluste
     expected = (count - 1) / count * moved.T @ moved
     found = jackknife(information, scores, each_alone(count))
     np.testing.assert_allclose(found.matrix, expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found.degrees_of_freedom, count - 1)
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(3, 9), size=st.integers(1, 3))
+def test_degrees_of_freedom_are_those_of_the_scatter_of_equal_independent_errors(
+    seed: int, count: int, size: int
+) -> None:
+    """The refits are linear in the errors, so that their covariance M is known, and (tr M)^2 / tr M^2 with it."""
+    rng = np.random.default_rng(seed)
+    columns = rng.standard_normal((count, 8, size)) * rng.uniform(0.3, 1.0, (count, 1, 1))
+    of_all, moved = np.linalg.pinv(columns.reshape(-1, size)), np.zeros((count, size, count * 8))
+    for left_out in range(count):
+        kept = np.repeat(np.arange(count) != left_out, 8)
+        moved[left_out, :, kept] = np.linalg.pinv(columns.reshape(-1, size)[kept]).T
+        moved[left_out] -= of_all
+    wanted = []
+    for of_number in np.swapaxes(moved, 0, 1):
+        covariance = of_number @ of_number.T
+        wanted.append(np.trace(covariance) ** 2 / np.trace(covariance @ covariance))
+    information = np.einsum("cri,crj->cij", columns, columns)
+    values = rng.standard_normal((count, 8))
+    scores = np.einsum("cri,cr->ci", columns, columns @ least_squares(columns, values) - values)
+    found = jackknife(information, scores, each_alone(count))
+    np.testing.assert_allclose(found.degrees_of_freedom, np.clip(wanted, 1, count - 1), rtol=1e-6)
 
 
 def test_a_prior_adds_its_own_part_and_has_no_scatter() -> None:
@@ -83,8 +105,11 @@ def test_a_prior_adds_its_own_part_and_has_no_scatter() -> None:
     moved = scores[:, 0] / (16.0 - 2.0)
     of_scatter = 3 / 4 * np.square(moved).sum()
     assert found.matrix[0, 0] == pytest.approx(of_scatter + 8.0 / 16.0**2)
+    # M of four equal clusters is 2 / 14^2 (1 - 2/16 (1 + 8/16)) on its diagonal, less the rest elsewhere
+    alike = 2.0 * np.eye(4) - 4.0 * (1 / 16 + 8 / 16**2)
+    freedom = np.trace(alike) ** 2 / np.trace(alike @ alike)
     # Satterthwaite: the exact part adds no variance to that of the variance
-    assert found.degrees_of_freedom[0] == pytest.approx(3 * (found.matrix[0, 0] / of_scatter) ** 2)
+    assert found.degrees_of_freedom[0] == pytest.approx(min(freedom, 3) * (found.matrix[0, 0] / of_scatter) ** 2)
 
 
 def test_what_neither_runs_nor_prior_tell_has_no_variance() -> None:

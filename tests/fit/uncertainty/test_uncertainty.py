@@ -28,9 +28,9 @@ from omnibench.fit.identifiability import (
     warnings_of_calibration,
 )
 from omnibench.fit.inspect import inspect_dataset
+from omnibench.fit.intervals import Bootstrap, Clusters, RatioIntervals, units_of
 from omnibench.fit.parameterisation import ExplicitBox
 from omnibench.fit.problem import Budget, CalibrationProblem
-from omnibench.fit.ratio_intervals import Bootstrap, RatioIntervals, Units, units_of
 from omnibench.fit.span import aligned, driven_span, unidentified_directions
 from omnibench.fit.trajectory_fit import information_of_runs
 from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, physical_parameters, uncertainty_of
@@ -220,8 +220,8 @@ def test_the_degrees_of_freedom_of_a_sum_lie_between_those_of_its_terms() -> Non
 BOOTSTRAP = Bootstrap(resamples=2000, seed=1)
 
 
-def units(commands: int, repetitions: int = 1) -> Units:
-    return Units("command", np.repeat(np.arange(commands), repetitions))
+def units(commands: int, repetitions: int = 1) -> Clusters:
+    return Clusters("command", np.repeat(np.arange(commands), repetitions))
 
 
 def test_commands_are_the_unit_where_runs_repeat_them_and_runs_elsewhere() -> None:
@@ -247,7 +247,7 @@ def test_the_number_of_units_decides_the_method_and_is_said(count: int, words: s
     of = units(count, 2)
     costs = np.random.default_rng(0).uniform(1.0, 2.0, 2 * count)
     found = RatioIntervals(BOOTSTRAP).mean(costs, of)
-    assert of.words == words
+    assert of.ratio_words == words
     assert (found.known is None) == words.startswith("no interval")
     assert found.value == pytest.approx(costs.mean())
 

@@ -16,8 +16,7 @@ from omnibench.data.true_poses import TruePath
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.floor_plan import PLANS, FloorPlan, RoomPlan, make_plan
-from omnibench.simulate.lidar import Lidar, LidarMount, measure_scans, scan_stamps
-from omnibench.simulate.ray_casting import cast_rays
+from omnibench.simulate.lidar import Lidar, LidarMount, cast_rays, measure_scans, scan_stamps
 
 EXACT = Lidar(rays=360, noise=0.0, far_noise=0.0, dropouts=0.0, resolution=1e-6)
 FLOAT32 = 2e-6  # m: steps of float32 below 16 m, and of the resolution

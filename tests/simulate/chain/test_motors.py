@@ -201,13 +201,6 @@ def test_voltages_stay_within_the_supply_and_the_integral_does_not_wind_up() -> 
     assert turning(run)[2500:] == pytest.approx(np.full(500, 3.0), abs=0.1)
 
 
-def test_a_motor_of_its_own_for_each_wheel() -> None:
-    weak, strong = Motor(supply_voltage=12.0), Motor()
-    (run,) = drive_session([weak, strong], Controller(), Encoder(), [np.full((200, 2), 50.0)], PERIOD, np.zeros(2))
-    slow, fast = np.diff(run.wheel_angles, axis=0)[-1] / STEP
-    assert (slow, fast) == pytest.approx((weak.fastest_rate, strong.fastest_rate), rel=1e-3)
-
-
 # Encoders and sessions
 
 
@@ -283,14 +276,6 @@ def test_a_motor_controller_link_or_profile_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=named):
         validate(part, settings, "motor")
-
-
-@pytest.mark.parametrize(
-    ("motors", "period", "named"), [(Motor(), 0.0125, r"sample_period 0\.0125 s"), ([Motor()] * 2, 0.01, "2 motors")]
-)
-def test_broken_milliseconds_and_fewer_motors_than_wheels_are_refused(motors: Any, period: float, named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        drive_session(motors, Controller(), Encoder(), [], period, np.zeros(3))
 
 
 # Motion commands: what is sent, what the set point makes of it, and when the watchdog stops the robot.
@@ -436,8 +421,3 @@ def test_a_run_ends_with_the_rest_that_was_asked_for() -> None:
     resting = driven.times > WAY / 0.2 + 0.4 + 1e-9  # the ramp takes 0.2 / 0.5 s
     assert resting.sum() == SETTLE / PERIOD
     assert not driven.twists[resting].any()
-
-
-def test_a_command_that_moves_nothing_is_refused() -> None:
-    with pytest.raises(ConfigError, match="v0_a0_w0"):
-        motion(Command(0.0, 0.0, 0.0))
