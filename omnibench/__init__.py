@@ -26,8 +26,7 @@ _MODULES = {
     "live.node": "LiveNode",
     "live.wire.subscriber": "subscribe",
     "registry": "load_plugins",
-    "robot.calibration": "Calibration read_calibration write_calibration",
-    "robot.dead_reckoning": "odometry",
+    "robot.calibration": "Calibration odometry read_calibration write_calibration",
     "robot.export.formats": "export_calibration",
     "robot.kinematics": "Robot Wheel",
     "simulate.source": "read_simulation simulate_dataset",
@@ -67,9 +66,9 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.live.wire.subscriber import subscribe as subscribe
     from omnibench.registry import load_plugins as load_plugins
     from omnibench.robot.calibration import Calibration as Calibration
+    from omnibench.robot.calibration import odometry as odometry
     from omnibench.robot.calibration import read_calibration as read_calibration
     from omnibench.robot.calibration import write_calibration as write_calibration
-    from omnibench.robot.dead_reckoning import odometry as odometry
     from omnibench.robot.export.formats import export_calibration as export_calibration
     from omnibench.robot.kinematics import Robot as Robot
     from omnibench.robot.kinematics import Wheel as Wheel

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from driven_path import DrivenPath
 from sample_robots import APR_02
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -12,7 +13,6 @@ from omnibench.data.references import Reference, References
 from omnibench.data.scans import ScansInMemory
 from omnibench.data.true_poses import TruePath
 from omnibench.robot.kinematics import Array, wheel_equations
-from omnibench.robot.odometry import DrivenPath
 from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
 

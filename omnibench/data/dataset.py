@@ -22,11 +22,10 @@ from omnibench.data.references import NUMBERS, TURN, References, reference_flaw,
 from omnibench.data.scans import Scans
 from omnibench.data.stored import Flaw, Table
 from omnibench.errors import DataError, UnknownNameError, nearest, require_type
-from omnibench.robot.arrays import frame_of
 from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.samples import Samples, digest_of, with_samples
+from omnibench.robot.odometry import Samples, WheelLog, digest_of, with_samples
+from omnibench.robot.wheel_logs import frame_of
 from omnibench.views import Shown
 from omnibench.words import plural, some
 

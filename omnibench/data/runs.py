@@ -41,8 +41,7 @@ from omnibench.errors import DataError
 from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array, Robot, fastest_rates, in_the_middle, interpolated
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.samples import Samples
+from omnibench.robot.odometry import Samples, WheelLog
 from omnibench.words import plural, some
 
 _NUMBER = re.compile(r"(?:run|trial|exp(eriment)?|test|take|rep(etition)?|drive|log|bag|recording|traj(ectory)?)?\d*")

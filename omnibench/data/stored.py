@@ -25,7 +25,7 @@ from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
 from omnibench.progress import tell_reading
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.samples import Samples
+from omnibench.robot.odometry import Samples
 
 Rows = NDArray[np.intp]  # indices of rows of a table
 Flaw = tuple[int, str]  # row (0 is the first) of an array, and what is wrong there

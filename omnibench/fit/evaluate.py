@@ -25,7 +25,7 @@ from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.samples import DIGITS
+from omnibench.robot.odometry import DIGITS
 from omnibench.views import Shown
 from omnibench.words import noun_for, plural
 

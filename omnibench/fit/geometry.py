@@ -1,6 +1,6 @@
 """The geometry of a robot as what is searched: parametric calibration, within physical limits.
 
-The numbers are those of robot/geometry.py. The tracked point of a robot that cannot slide is searched where it is not
+The numbers are those of robot/physical.py. The tracked point of a robot that cannot slide is searched where it is not
 known; a car's steering offset is an effect. What turns the signals themselves, such as the gain of a steering angle,
 are effects, too.
 """
@@ -17,8 +17,7 @@ from pydantic import Field, FiniteFloat, field_validator
 from omnibench.config import Model
 from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
 from omnibench.robot import kinematics
-from omnibench.robot.geometry import Geometry, Number
-from omnibench.robot.physical import PhysicalParameter, unit_of
+from omnibench.robot.physical import Geometry, Number, PhysicalParameter, unit_of
 
 Deviation = FiniteFloat | tuple[FiniteFloat, FiniteFloat]
 # A skid-steered base turns as if its wheels stood up to twice as far apart (Mandow et al., IROS 2007).

@@ -28,9 +28,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, TURNING_CENTRE, PhysicalTolerance
-from omnibench.robot.geometry import physical_tolerance as physical_tolerance
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
+from omnibench.robot.physical import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, TURNING_CENTRE, PhysicalTolerance
+from omnibench.robot.physical import physical_tolerance as physical_tolerance
 
 MountChoice = Literal["known", "fit"]
 _NUMBERS_EACH = 2  # measured ones for each that is fitted; chosen

@@ -20,7 +20,7 @@ from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
 from omnibench.errors import DataError
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration, WheelLog, locate
+from omnibench.robot.odometry import Integration, RunSamples, WheelLog
 from omnibench.robot.stored_odometry import odometry_of
 
 _GRID = 16  # headings among which Newton's steps begin: Eq. (2) has two waves a turn
@@ -440,7 +440,7 @@ class _Ways:
 
     def __init__(self, log: WheelLog) -> None:
         self._log = log
-        self._sample, self._share = locate(log.times, log.stamps)
+        self._sample, self._share = RunSamples.of([log.times]).locate([log.stamps])
 
     @property
     def _angles(self) -> Array:

@@ -1,12 +1,17 @@
-"""The calibration file, format ``omnibench-calibration/1``: written by calibrators, read by all other commands."""
+"""The calibration file, format ``omnibench-calibration/1``: written by calibrators, read by all other commands.
+
+``odometry`` and ``Calibration.predict`` are for whoever has wheel rates and no data set.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
+from operator import not_
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +27,7 @@ from pydantic import (
 )
 
 from omnibench import config
-from omnibench.errors import ConfigError, DataError, require_type, shown
+from omnibench.errors import ConfigError, DataError, require_choice, require_type, shown
 from omnibench.files import write_text
 from omnibench.robot.corrections import Fade
 from omnibench.robot.effects.effect import Term, make_term
@@ -30,7 +35,7 @@ from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.robot.physical import PhysicalParameter, read_matrix
-from omnibench.robot.wheel_logs import logs_of
+from omnibench.robot.wheel_logs import log_of_arrays, logs_of
 from omnibench.views import Shown, as_pandas
 from omnibench.words import plural
 
@@ -40,10 +45,6 @@ _LARGEST_ELEMENT = 1e3  # m or rad per rad of wheel: no wheel is so large
 Row = tuple[FiniteFloat, ...]
 Fingerprint = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
 Deviation = Annotated[config.NonNegative, Field(le=1e3)]
-
-
-def _is_none(value: object) -> bool:
-    return value is None
 
 
 def _with_names(content: Any) -> Any:
@@ -79,14 +80,13 @@ class EffectTerm(config.Model):
     name: config.Name
     parameters: dict[str, FiniteFloat] = {}
     weights: str | None = Field(
-        None, description="of a learned effect: base64 of float32, at most 48 KiB", exclude_if=_is_none
+        None, description="of a learned effect: base64 of float32, at most 48 KiB", exclude_if=not_
     )
 
     @classmethod
     def of(cls, term: Term) -> EffectTerm:
         """A term of a model, as a file holds it."""
-        values = {name: float(value) for name, value in term.values.items()}
-        return cls(name=term.name, parameters=values, weights=term.weights)
+        return cls(name=term.name, parameters=dict(term.values), weights=term.weights)
 
     @property
     def numbers_in_words(self) -> Iterator[str]:
@@ -154,7 +154,7 @@ class Provenance(config.Model):
     seed: int
     cost: str
     loss: Literal["huber", "student_t"] | None = Field(
-        None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=_is_none
+        None, description="of the cost's norms; None: as the calibrator takes them", exclude_if=not_
     )
     box: str
     unidentified: Literal["keep", "fit", "shrink", "weigh"] = Field("keep", description="what the data hardly tell")
@@ -227,11 +227,13 @@ class Calibration(Shown, config.Model):
     integration: Integration
     effects: tuple[EffectTerm, ...] = ()
     parameters: _Parameters | None = Field(
-        None, description="radii, track, ... that matrix and effects mean, with 95 % intervals", exclude_if=_is_none
+        None,
+        description="radii, track, ... that matrix and effects mean, with 95 % intervals",
+        exclude_if=not_,
     )
     noise: Noise | None = None
     covariance: tuple[Row, ...] | None = Field(None, description="of the matrix, row by row, then of the effects")
-    slip: Slip | None = Field(None, description="by which runs scatter about the odometry", exclude_if=_is_none)
+    slip: Slip | None = Field(None, description="by which runs scatter about the odometry", exclude_if=not_)
     session: config.Name | None = Field(None, description="what drift terms are measured from")
     driven: tuple[tuple[FiniteFloat, FiniteFloat, FiniteFloat], ...] | None = Field(
         None, description="motions that it was fitted to, m/s, m/s, rad/s; its effects are not known to hold beyond"
@@ -239,7 +241,7 @@ class Calibration(Shown, config.Model):
     plain: tuple[Row, Row, Row] | None = Field(
         None,
         description="matrix without effects; these fade to it beyond driven motions, as far as they are not sure",
-        exclude_if=_is_none,
+        exclude_if=not_,
     )
     provenance: Provenance | None = None
 
@@ -419,21 +421,18 @@ def matrix_flaw(matrix: Array) -> str:
 
 def matrix_rows(matrix: Array) -> tuple[Row, Row, Row]:
     """A matrix (3, M) as rows of a document."""
-    first, second, third = (tuple(float(value) for value in row) for row in matrix)
+    first, second, third = covariance_rows(matrix)
     return first, second, third
 
 
 def covariance_rows(covariance: Array) -> tuple[Row, ...]:
     """A covariance (n, n) as rows of a document."""
-    return tuple(tuple(float(value) for value in row) for row in covariance)
+    return tuple(map(tuple, np.asarray(covariance, dtype=float).tolist()))
 
 
 def read_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file. DataError names the file and what is wrong."""
-    try:
-        return _checked(config.read_yaml(Path(path)), str(path))
-    except ConfigError as error:
-        raise DataError(str(error)) from None
+    return _checked(partial(config.read_yaml, Path(path)), str(path))
 
 
 def parse_calibration(text: str, where: str, most: int = config.MOST_VALUES) -> Calibration:
@@ -441,19 +440,21 @@ def parse_calibration(text: str, where: str, most: int = config.MOST_VALUES) -> 
 
     most: values that the text may have.
     """
+    return _checked(partial(config.parse_yaml, text, where, most), where)
+
+
+def _checked(read: Callable[[], Any], where: str) -> Calibration:
+    """The calibration of a document. DataError: it cannot be read, or is none."""
     try:
-        return _checked(config.parse_yaml(text, where, most), where)
+        content = read()
+        version = content.get("format") if isinstance(content, dict) else None
+        if version != FORMAT:
+            raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
+        calibration = config.validate(Calibration, content, where)
+        for term in calibration.effects:
+            term.term(calibration.robot, where)
     except ConfigError as error:
         raise DataError(str(error)) from None
-
-
-def _checked(content: Any, where: str) -> Calibration:
-    version = content.get("format") if isinstance(content, dict) else None
-    if version != FORMAT:
-        raise DataError(f"{where}: format is {shown(version)}, expected {FORMAT!r}; is this a calibration file?")
-    calibration = config.validate(Calibration, content, where)
-    for term in calibration.effects:
-        term.term(calibration.robot, where)
     return calibration
 
 
@@ -466,3 +467,46 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """
     require_type(calibration, Calibration, "read_calibration")
     write_text(Path(path), config.to_yaml(calibration))
+
+
+def odometry(
+    robot: Robot | Calibration,
+    times: ArrayLike,
+    rates: ArrayLike,
+    *,
+    steering: ArrayLike | None = None,
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    stamps: ArrayLike | None = None,
+    integration: Integration | None = None,
+    angles: ArrayLike | None = None,
+) -> Array:
+    """Poses (K, 3) of a robot's odometry: x, y in m and the heading in rad, not wrapped.
+
+    robot: its design, or a calibration, effects included. times (F,): end of each wheel sample, s, > 0. rates (F, N):
+    mean rate of every measured wheel over the sample, rad/s. steering (F, S): of the steered wheels at the samples'
+    ends, rad. start (3,): pose at t = 0. stamps (K,): when poses are wanted, s; default: ``times``. integration: path
+    within a sample; default: ``arc``, or the calibration's. angles (F, N): of the wheels, rad, for effects that need
+    them. Source: Eq. (1) and (2) of Palacin et al. 2023.
+
+    DataError: a shape, a time or a value is wrong, or an effect needs data that are not given. ConfigError: ``robot``
+    is neither.
+
+    >>> import numpy as np
+    >>> cart = Robot(name="cart", wheels=[
+    ...     Wheel(name="left", type="fixed", radius=0.05, x=0, y=0.15),
+    ...     Wheel(name="right", type="fixed", radius=0.05, x=0, y=-0.15)])
+    >>> times = np.arange(1, 101) * 0.02
+    >>> poses = odometry(cart, times, np.full((100, 2), 4.0))  # 2 s at 0.05 m x 4 rad/s
+    >>> poses.shape, bool(np.allclose(poses[-1], [0.4, 0, 0]))
+    ((100, 3), True)
+    """
+    if integration is not None:
+        require_choice("integration", integration, get_args(Integration))
+    if isinstance(robot, Robot):
+        model = OdometryModel.of_design(robot, integration or "arc")
+    else:
+        require_type(robot, Calibration, "read_calibration, or a Robot with omnibench.Robot(name=..., wheels=[...])")
+        model = robot.model
+        model = replace(model, integration=integration or model.integration)
+    log = log_of_arrays(model.robot, times, rates, start=start, stamps=stamps, steering=steering, angles=angles)
+    return model.poses([log])[0]

@@ -18,10 +18,14 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, needed, signals_of
 
-_MISSING: dict[Need, str] = {
-    "wheel_angles": "absolute wheel angles (phi_* in wheels), which were not recorded",
-    "session_time": "the time since the session's start (started_at in trajectories), which is not known",
-    "session": "the session's name (session in trajectories), which is not known",
+# What of a log effects may need, where it stands there, and what is missing without it, in words
+_MISSING: dict[Need, tuple[str, str]] = {
+    "wheel_angles": ("wheel_angles", "absolute wheel angles (phi_* in wheels), which were not recorded"),
+    "session_time": (
+        "started_at",
+        "the time since the session's start (started_at in trajectories), which is not known",
+    ),
+    "session": ("session", "the session's name (session in trajectories), which is not known"),
 }
 
 # Lengths of motions (m/s, turning as speed at the wheels) are shares of the largest in the domain. All are chosen.
@@ -53,9 +57,9 @@ def corrected(terms: Sequence[Term], signals: Signals) -> Corrected:
     """The wheel samples with all corrections, each computed from the uncorrected signals, so that their order does not
     matter. PluginError: a correction has a wrong shape.
     """
-    rates, steering, body, world = signals.rates, signals.steering, None, None
-    count, wheels = rates.shape
-    widths = {"body": 3, "world": 2, "steering": 0 if steering is None else steering.shape[1]}
+    sums: dict[str, Array | None] = {"wheel": signals.rates, "steering": signals.steering}
+    count, wheels = signals.rates.shape
+    widths = {"body": 3, "world": 2, "steering": 0 if signals.steering is None else signals.steering.shape[1]}
     for term in terms:
         effect = term.effect
         assert isinstance(effect, MotionEffect)
@@ -63,15 +67,10 @@ def corrected(terms: Sequence[Term], signals: Signals) -> Corrected:
         shape = (count, widths.get(effect.stage, wheels))
         if added.shape != shape:
             raise PluginError(f"effect {term.name!r}: its correction has shape {added.shape}, expected {shape}")
-        if effect.stage == "body":
-            body = added if body is None else body + added
-        elif effect.stage == "world":
-            world = added if world is None else world + added
-        elif effect.stage == "steering":
-            steering = needed(steering) + added
-        else:
-            rates = rates + added
-    return Corrected(rates, steering, body, world)
+        stage = effect.stage if effect.stage in widths else "wheel"
+        before = sums.get(stage)
+        sums[stage] = added if before is None else before + added
+    return Corrected(needed(sums["wheel"]), sums["steering"], sums.get("body"), sums.get("world"))
 
 
 def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> tuple[Array, Array | None]:
@@ -103,12 +102,12 @@ def needs_of(terms: Sequence[Term]) -> frozenset[Need]:
 
 def check_needs(terms: Sequence[Term], log: WheelLog) -> None:
     """Raise DataError, in one line, if a log lacks data that an effect needs."""
-    recorded = {"wheel_angles": log.wheel_angles, "session_time": log.started_at, "session": log.session}
     for term in terms:
-        for need in sorted(term.effect.needs):
-            if need in recorded and recorded[need] is None:
+        for need in sorted(term.effect.needs & _MISSING.keys()):
+            attribute, words = _MISSING[need]
+            if getattr(log, attribute) is None:
                 raise DataError(
-                    f"effect {term.name!r} needs {_MISSING[need]}; record it, or take the effect out of the calibration"
+                    f"effect {term.name!r} needs {words}; record it, or take the effect out of the calibration"
                 )
 
 

@@ -22,6 +22,7 @@ pose with its counterpart, by NumPy's rules of broadcasting.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -36,6 +37,8 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    PlainSerializer,
+    PlainValidator,
     SerializerFunctionWrapHandler,
     model_serializer,
     model_validator,
@@ -43,9 +46,20 @@ from pydantic import (
 
 from omnibench.config import Model, Name
 from omnibench.errors import UnknownNameError
-from omnibench.robot.arrays import Array as Array
-from omnibench.robot.arrays import JsonArray as JsonArray
 from omnibench.views import Shown
+
+Array = NDArray[np.floating[Any]]
+
+
+def _as_lists(array: Array) -> list[Any]:
+    """Nested lists; of texts where JSON has no number for an element."""
+    return (array if np.isfinite(array).all() else array.astype(str)).tolist()
+
+
+# An array as a field that pydantic writes as nested lists and reads back to the last bit.
+JsonArray = Annotated[
+    Array, PlainValidator(lambda values: np.array(values, dtype=float)), PlainSerializer(_as_lists, list[Any])
+]
 
 WheelType = Literal["omni", "mecanum", "fixed", "steered"]
 RobotClass = Literal["omni", "mecanum", "differential", "skid", "tricycle", "car", "swerve", "mixed"]
@@ -128,6 +142,8 @@ def _looks_like_radians(angle: float) -> float:
 
 
 _Angle = Annotated[FiniteFloat, AfterValidator(_looks_like_radians)]
+_Length = Annotated[FiniteFloat, Field(ge=1e-6, le=_FARTHEST)]
+_Place = Annotated[FiniteFloat, Field(ge=-_FARTHEST, le=_FARTHEST)]
 
 
 def in_degrees_too(*keys: str) -> Callable[[dict[str, Any]], None]:
@@ -154,16 +170,14 @@ class Wheel(Model):
     model_config = ConfigDict(json_schema_extra=in_degrees_too("angle", "roller_angle"))
 
     name: Name = Field(min_length=1, pattern=r"^[A-Za-z0-9_]+$", description="ends the column names: omega_<name>")
-    radius: FiniteFloat = Field(ge=1e-6, le=1e3, description="m")
+    radius: _Length = Field(description="m")
     type: WheelType | None = Field(None, description="default: omni or mecanum, by the roller angle")
-    distance: FiniteFloat | None = Field(
-        None, ge=1e-6, le=_FARTHEST, description="lever arm about the robot's centre, m"
-    )
+    distance: _Length | None = Field(None, description="lever arm about the robot's centre, m")
     angle: _Angle | None = Field(
         None, description="direction of the axle (omni, mecanum) or of rolling (fixed, default 0), rad"
     )
-    x: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="in front of the robot's centre, m")
-    y: FiniteFloat | None = Field(None, ge=-_FARTHEST, le=_FARTHEST, description="to the left of the centre, m")
+    x: _Place | None = Field(None, description="in front of the robot's centre, m")
+    y: _Place | None = Field(None, description="to the left of the centre, m")
     roller_angle: FiniteFloat = Field(0.0, gt=-1.5, lt=1.5, description="0 omni, +-pi/4 mecanum; rad")
     driven: bool = Field(True, description="steered wheels: false if only the steering angle is measured")
     measured: bool = Field(True, description="false for a wheel that only guides or rolls along")
@@ -199,14 +213,11 @@ class Wheel(Model):
     @model_serializer(mode="wrap")
     def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Only what is said, so that files, hashes and documents of omni wheels stay as they were."""
-        plain: dict[str, Any] = dict.fromkeys(("type", "distance", "angle", "x", "y")) | {
-            "driven": True,
-            "measured": True,
-        }
+        plain: dict[str, Any] = dict.fromkeys(("type", "distance", "angle", "x", "y"))
+        plain |= {"driven": True, "measured": True}
         if self.type in ("fixed", "steered"):
             plain["roller_angle"] = 0.0
-        written: dict[str, Any] = write(self)
-        return {key: value for key, value in written.items() if key not in plain or value != plain[key]}
+        return {key: value for key, value in write(self).items() if key not in plain or value != plain[key]}
 
     @property
     def kind(self) -> WheelType:
@@ -309,34 +320,39 @@ class Drive:
         if self.direct:
             return rates
         assert steering is not None  # there are steered wheels
-        wheels, factors = self._columns
-        table = np.concatenate([np.ones((len(rates), 1)), np.cos(steering), np.sin(steering)], axis=1)
-        return rates.take(wheels, axis=1) * table.take(factors, axis=1)
+        wheels, _, _ = self._columns
+        return rates.take(wheels, axis=1) * self._factors(steering)
 
     @cached_property
-    def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The wheel (M) of each signal, and the column of (1, cos phi (S), sin phi (S)) that multiplies its rate."""
+    def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Wheel (M) of each signal, column (M) of (1, cos phi (S), sin phi (S)) that multiplies it, and first signals.
+
+        First signals (N): those of each wheel.
+        """
         columns: list[tuple[int, int]] = []
+        first = []
         for wheel, pair in enumerate(self.pairs):
+            first.append(len(columns))
             columns += [(wheel, 0)] if pair < 0 else [(wheel, 1 + pair), (wheel, 1 + pair + len(self.steered))]
         wheels, factors = np.array(columns).T
-        return wheels, factors
+        return wheels, factors, np.array(first)
+
+    def _factors(self, steering: Array) -> Array:
+        """Factors (F, M) by which steering angles (F, S) multiply the rates of the signals' wheels."""
+        table = np.concatenate([np.ones((len(steering), 1)), np.cos(steering), np.sin(steering)], axis=1)
+        return table.take(self._columns[1], axis=1)
 
     def slopes(self, rates: Array, steering: Array | None) -> tuple[Array, Array]:
         """Derivatives (F, M, N) and (F, M, S) of the signals by the rates and by the steering angles in the middles."""
-        by_rate = np.zeros((len(rates), len(self.names), len(self.wheels)))
-        by_angle = np.zeros((len(rates), len(self.names), len(self.steered)))
-        signal = 0
-        for wheel, pair in enumerate(self.pairs):
-            if pair < 0:
-                by_rate[:, signal, wheel] = 1
-                signal += 1
-                continue
-            assert steering is not None  # this wheel steers
-            cosine, sine, both = np.cos(steering[:, pair]), np.sin(steering[:, pair]), slice(signal, signal + 2)
-            by_rate[:, both, wheel] = np.column_stack([cosine, sine])
-            by_angle[:, both, pair] = rates[:, wheel, None] * np.column_stack([-sine, cosine])
-            signal += 2
+        wheels, _, first = self._columns
+        factors = np.ones(rates.shape) if steering is None else self._factors(steering)
+        by_rate = np.zeros((*factors.shape, len(self.wheels)))
+        by_angle = np.zeros((*factors.shape, len(self.steered)))
+        by_rate[:, np.arange(len(wheels)), wheels] = factors
+        for wheel, (along, pair) in enumerate(zip(first, self.pairs, strict=True)):
+            if pair >= 0:
+                by_angle[:, along, pair] = rates[:, wheel] * -factors[:, along + 1]
+                by_angle[:, along + 1, pair] = rates[:, wheel] * factors[:, along]
         return by_rate, by_angle
 
     def commands(self, signals: Array) -> tuple[Array, Array]:
@@ -345,16 +361,12 @@ class Drive:
         Steering angles lie within half a turn, and the rates of steered wheels are not negative; one that stands steers
         straight ahead.
         """
-        rates, steering = np.empty((len(signals), len(self.wheels))), np.zeros((len(signals), len(self.steered)))
-        signal = 0
-        for wheel, pair in enumerate(self.pairs):
-            if pair < 0:
-                rates[:, wheel] = signals[:, signal]
-                signal += 1
-            else:
-                along, across = signals[:, signal], signals[:, signal + 1]
-                rates[:, wheel], steering[:, pair] = np.hypot(along, across), np.arctan2(across, along)
-                signal += 2
+        _, _, first = self._columns
+        rates, steering = signals[:, first], np.zeros((len(signals), len(self.steered)))
+        for wheel, (along, pair) in enumerate(zip(first, self.pairs, strict=True)):
+            if pair >= 0:
+                ahead, across = signals[:, along], signals[:, along + 1]
+                rates[:, wheel], steering[:, pair] = np.hypot(ahead, across), np.arctan2(across, ahead)
         return rates, steering
 
 
@@ -469,8 +481,13 @@ class Robot(Shown, Model):
 
     name: Name
     wheels: tuple[Wheel, ...] = Field(min_length=1)
-    mount: Mount | None = Field(None, description="the tracked point in the robot's frame; default: its centre")
-    skid: bool = Field(False, description="true for skid steering: fixed wheels slide when the robot turns")
+    # What is not said is not written either, so that files, hashes and documents of earlier versions stay as they were.
+    mount: Mount | None = Field(
+        None, description="the tracked point in the robot's frame; default: its centre", exclude_if=operator.not_
+    )
+    skid: bool = Field(
+        False, description="true for skid steering: fixed wheels slide when the robot turns", exclude_if=operator.not_
+    )
 
     @model_validator(mode="after")
     def _moves(self) -> Robot:
@@ -504,12 +521,6 @@ class Robot(Shown, Model):
                 "add a measured wheel or a steering angle"
             )
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Only what is said, so that files, hashes and documents of earlier versions stay as they were."""
-        plain: dict[str, Any] = {"mount": None, "skid": False}
-        return {key: value for key, value in write(self).items() if key not in plain or value != plain[key]}
 
     @property
     def drive(self) -> Drive:

@@ -1,7 +1,14 @@
-"""Physical parameters of a robot by its matrix: radii, track, wheelbase, distances, angles, zeros, tracked point.
+"""The geometry of a robot, the matrix that it makes, and the way back: physical parameters by a matrix.
 
-``Geometry`` maps the numbers v of a robot's geometry to its matrix K (3, M); this is the way back. Robots of a class
-lie about their design as
+Of a wheel on rollers, or one that rolls in one direction, count radius, distance (the lever arm of its driving force
+about the robot's centre) and, on rollers, the angle of its axle: Eq. (3) of Palacin et al. 2023 for three omni wheels.
+Of a steered wheel whose rate is measured count radius, place x, y and offset, by which its true steering angle exceeds
+the measured one. Of a car count the radius of its rear wheels, its wheelbase and the offset of its steering. The place
+and yaw of the tracked point in the robot's frame count, too (Censi et al., IEEE T-RO 29:475, 2013). What turns the
+signals themselves, such as the gain of a steering angle, are effects.
+
+``Geometry`` maps the numbers v of a robot's geometry to its matrix K (3, M); ``read_matrix`` is the way back, to radii,
+track, wheelbase, distances, angles, zeros and the tracked point. Robots of a class lie about their design as
 
     v = v0 + B z,    p = p0 + R z,    z ~ N(0, 1),                                                        (1)
 
@@ -25,6 +32,8 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
 from typing import Literal, Protocol
 
 import numpy as np
@@ -33,8 +42,8 @@ from scipy.special import chdtri, stdtrit
 
 from omnibench.config import Model, Name
 from omnibench.errors import DataError
-from omnibench.robot.geometry import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, Geometry, physical_tolerance
-from omnibench.robot.kinematics import Array, CarDrive, Robot, relative_deviations
+from omnibench.robot import kinematics
+from omnibench.robot.kinematics import Array, CarDrive, Robot, RobotClass, class_of, relative_deviations
 
 INTERVAL = 0.95  # probability of the intervals, by convention; every table of the program says 95 %
 # Degrees of freedom that stand for infinity: the quantile of Student's t differs from the normal one by 2e-9 there.
@@ -52,6 +61,175 @@ _MISFIT = 1e-3  # probability that the matrix of a geometry misses the one that 
 # 2023, section 4.2, of the parameters of their Eq. (8)).
 _IMPLAUSIBLE = 0.10
 _NO_LENGTH = 1e-6  # m: a shorter track or wheelbase is none
+# Share of each number's scale: step of central differences, near the cube root of the rounding (Press et al.,
+# Numerical Recipes, 2007, section 5.7). Half of it and twice change nothing (tests/studies/constants_fit.py).
+_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class PhysicalTolerance:
+    """Standard deviations: of radii, each row's factor and elements, as shares; of the lost rate, rad/s."""
+
+    radius: float
+    rows: tuple[float, float, float]
+    elements: float
+    lost_rate: float
+
+
+# Tolerances were chosen once, while looking at the recordings of configs/real_robots.yaml: half and twice of each make
+# 0.90 to 1.15 times the error of a robot (tests/studies/prior_study.py). The lost rate of omni wheels, whose rollers
+# creep, is ten times that of tyres.
+_TYRES = PhysicalTolerance(0.01, (0.02, 0.02, 0.05), 0.002, 0.004)
+_STEERED = PhysicalTolerance(0.02, (0.02, 0.02, 0.05), 0.005, 0.01)
+_TOLERANCES: Mapping[RobotClass, PhysicalTolerance] = MappingProxyType(
+    {
+        "differential": _TYRES,
+        "skid": PhysicalTolerance(0.02, (0.05, 0.05, 0.2), 0.005, 0.004),
+        "tricycle": _STEERED,
+        "car": _STEERED,
+        "swerve": _STEERED,
+        "omni": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.03),
+        "mecanum": PhysicalTolerance(0.02, (0.06, 0.06, 0.06), 0.01, 0.01),
+        "mixed": PhysicalTolerance(0.02, (0.05, 0.05, 0.05), 0.01, 0.01),
+    }
+)
+STEERING_ZERO = 0.1  # rad, of a steering angle's zero: a mounted encoder is trued to some degrees
+TRACKED_POINT = 0.05  # m: a tracker that is not on the axle's middle; of the corelli tricycle by 0.1 m
+TURNING_CENTRE = 0.05  # m: the point about which a skid-steered base turns, by load and ground
+TRACKED_YAW = 0.035  # rad, of a tracker's direction
+
+
+def physical_tolerance(robot: Robot) -> PhysicalTolerance:
+    """The tolerance of a robot's class."""
+    return _TOLERANCES[class_of(robot)]
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a geometry: kind (radius, distance, ...), name of its wheel, design value, unit of deviations."""
+
+    kind: str
+    owner: str
+    design: float
+    scale: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}_{self.owner}" if self.owner else self.kind
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """The numbers of a robot's geometry, kind by kind, and the matrix that they make."""
+
+    robot: Robot
+
+    @cached_property
+    def numbers(self) -> tuple[Number, ...]:
+        """The numbers at their design values; the pose of the tracked point stands last."""
+        robot, mount = self.robot, self.robot.mount or kinematics.Mount()
+        reach = robot.reach or 1.0  # 0 for one wheel at the centre
+        tracked = (
+            Number("mount_x", "", mount.x, reach),
+            Number("mount_y", "", mount.y, reach),
+            Number("mount_yaw", "", mount.yaw, 1.0),
+        )
+        if isinstance(robot.drive, CarDrive):
+            radius, wheelbase = float(robot.radii.mean()), float(np.mean(robot.drive.ahead, axis=0)[0])
+            car = (Number("radius", "", radius, radius), Number("wheelbase", "", wheelbase, abs(wheelbase)))
+            return (*car, Number("offset", "", 0.0, 1.0), *tracked)
+        plain = [wheel for wheel in robot.measured if not wheel.has_steering]
+        steered = [wheel for wheel in robot.measured if wheel.has_steering]
+        return (
+            *(Number("radius", wheel.name, wheel.radius, wheel.radius) for wheel in robot.measured),
+            *(Number("distance", wheel.name, wheel.lever, abs(wheel.lever) or reach) for wheel in plain),
+            *(Number("angle", wheel.name, wheel.axle, 1.0) for wheel in plain if wheel.kind != "fixed"),
+            *(Number("x", wheel.name, wheel.position[0], wheel.reach or reach) for wheel in steered),
+            *(Number("y", wheel.name, wheel.position[1], wheel.reach or reach) for wheel in steered),
+            *(Number("offset", wheel.name, 0.0, 1.0) for wheel in steered),
+            *tracked,
+        )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names (n,) of the numbers."""
+        return tuple(number.name for number in self.numbers)
+
+    @cached_property
+    def design(self) -> Array:
+        """The numbers (n,) of the design."""
+        return np.array([number.design for number in self.numbers])
+
+    @cached_property
+    def scale(self) -> Array:
+        """Scale (n,) of each number: of radii and distances the design, m; of places the reach; of angles 1 rad."""
+        return np.array([number.scale for number in self.numbers])
+
+    def matrices(self, vectors: Array) -> Array:
+        """Matrices (P, 3, M) of vectors (P, n) of numbers."""
+        of_number = dict(zip(self.names, vectors.T, strict=True))
+        matrices, mount = self._matrices_of_centre(of_number), vectors[:, -3:]
+        if not (mount == self.design[-3:]).all():
+            return _twists(*mount.T) @ matrices
+        return matrices if self.robot.mount is None else self.robot.mount.twist @ matrices
+
+    def slopes(self, vector: Array) -> Array:
+        """Derivatives (3M, n) of the matrix elements, row by row, by central differences."""
+        steps = _STEP * np.diag(self.scale)
+        difference = self.matrices(vector + steps) - self.matrices(vector - steps)
+        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
+        return slopes
+
+    def _matrices_of_centre(self, of_number: Mapping[str, Array]) -> Array:
+        """Matrices (P, 3, M) of the robot's centre, from the values (P,) of each number."""
+        robot = self.robot
+        if isinstance(robot.drive, CarDrive):
+            radius, wheelbase, offset = (of_number[name][:, None] for name in ("radius", "wheelbase", "offset"))
+            matrices = robot.centre_matrix * (radius / robot.radii.mean())[..., None]
+            matrices[..., 1] *= float(np.mean(robot.drive.ahead, axis=0)[0]) / wheelbase
+            if offset.any():  # tan(phi + c) is tan phi + c near phi = 0
+                matrices[..., 0] += offset * matrices[..., 1]
+            return matrices
+        if all(wheel.kind in ("omni", "mecanum") for wheel in robot.wheels):
+            names = [wheel.name for wheel in robot.measured]
+            radius, distance, angle = (
+                np.stack([of_number[f"{kind}_{name}"] for name in names], axis=1)
+                for kind in ("radius", "distance", "angle")
+            )
+            rollers = [wheel.roller_angle for wheel in robot.measured]
+            return kinematics.inverse_kinematic_matrices(radius, distance, angle, rollers)
+        rows: list[Array] = []
+        for wheel in robot.measured:
+            radius = of_number[f"radius_{wheel.name}"]
+            if wheel.has_steering:
+                rows += _steered_rows(radius, *(of_number[f"{kind}_{wheel.name}"] for kind in ("x", "y", "offset")))
+            else:
+                angle = of_number.get(f"angle_{wheel.name}", np.full(len(radius), wheel.axle))
+                distance = of_number[f"distance_{wheel.name}"]
+                rows.append(kinematics.wheel_rows(radius, distance, angle, np.array(wheel.roller_angle)))
+        basis = robot.allowed_basis
+        inverse: Array = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
+        return inverse
+
+
+def _twists(x: Array, y: Array, yaw: Array) -> Array:
+    """The matrices (P, 3, 3) that make the twist of a tracked point, at poses (P,), of the centre's."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    zero, one = np.zeros(len(x)), np.ones(len(x))
+    rows = [
+        [cosine, sine, x * sine - y * cosine],
+        [-sine, cosine, x * cosine + y * sine],
+        [zero, zero, one],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _steered_rows(radius: Array, x: Array, y: Array, offset: Array) -> list[Array]:
+    """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (K1) of kinematics.py, turned."""
+    cosine, sine = np.cos(offset), np.sin(offset)
+    along = np.stack([cosine, sine, x * sine - y * cosine], axis=-1) / radius[:, None]
+    across = np.stack([-sine, cosine, x * cosine + y * sine], axis=-1) / radius[:, None]
+    return [along, across]
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,23 +477,29 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
     design: dict[str, float] = {}
     columns: list[tuple[Mapping[str, float], Mapping[str, float]]] = []  # of B and of R
 
+    def vary(
+        deviation: float, changes: Mapping[str, float], name: str = "", value: float = 0.0, unit: float = 1.0
+    ) -> None:
+        """A deviation times these changes of the geometry, and times the unit of the parameter that is reported."""
+        reported = {name: deviation * unit} if name else {}
+        columns.append(({number: deviation * change for number, change in changes.items()}, reported))
+        design.update(dict.fromkeys(reported, value))
+
     # Radii. The matrix of a car has the mean of its rear wheels'.
     for wheel in robot.measured:
-        name, deviation = f"radius_{wheel.name}", tolerance.radius * wheel.radius
-        design[name] = wheel.radius
-        changes: Mapping[str, float] = {"radius": deviation / len(robot.measured)} if car else {name: deviation}
-        columns.append((changes, {name: deviation}))
+        name = f"radius_{wheel.name}"
+        changes: Mapping[str, float] = {"radius": 1 / len(robot.measured)} if car else {name: 1.0}
+        vary(tolerance.radius * wheel.radius, changes, name, wheel.radius)
 
     # Track and wheelbase: changes of numbers where wheels stand farther from the middle between them, or from the axle.
     stretched: list[tuple[str, Mapping[str, float], float]] = []
     fixed = [wheel for wheel in robot.measured if wheel.kind == "fixed" and not car]
     if fixed:
         sides = [math.copysign(1.0, math.cos(wheel.rolling - fixed[0].rolling)) for wheel in fixed]
-        places = [side * wheel.lever for side, wheel in zip(sides, fixed, strict=True)]
-        middle, length = _middle(places)
+        middle, length = _middle([side * wheel.lever for side, wheel in zip(sides, fixed, strict=True)])
         changes = {
-            f"distance_{wheel.name}": side * (place - middle)
-            for wheel, side, place in zip(fixed, sides, places, strict=True)
+            f"distance_{wheel.name}": side * (side * wheel.lever - middle)
+            for wheel, side in zip(fixed, sides, strict=True)
         }
         stretched.append(("track", changes, length))
     if car:
@@ -327,38 +511,30 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
         stretched.append(("wheelbase", ahead, float(np.mean(np.abs(list(ahead.values()))))))
     elif steered:
         for name, axis in (("track", 1), ("wheelbase", 0)):
-            places = [wheel.position[axis] for wheel in steered]
-            middle, length = _middle(places)
-            numbers = [f"{'xy'[axis]}_{wheel.name}" for wheel in steered]
+            middle, length = _middle([wheel.position[axis] for wheel in steered])
+            ways = {f"{'xy'[axis]}_{wheel.name}": wheel.position[axis] - middle for wheel in steered}
             if name == "wheelbase" or not fixed:
-                stretched.append(
-                    (name, {each: place - middle for each, place in zip(numbers, places, strict=True)}, length)
-                )
-            columns += [({number: tolerance.elements * robot.reach}, {}) for number in numbers]
+                stretched.append((name, ways, length))
+            for number in ways:
+                vary(tolerance.elements * robot.reach, {number: 1.0})
     share = tolerance.rows[2]  # as turning is off
     for name, changes, length in stretched:
         if length > _NO_LENGTH:
-            design[name] = length
-            columns.append(({number: share * change for number, change in changes.items()}, {name: share * length}))
+            vary(share, changes, name, length, length)
 
     # Distances and angles of wheels on rollers.
     on_rollers = [wheel for wheel in robot.measured if wheel.kind in ("omni", "mecanum")]
     for wheel in on_rollers:
         name, length = f"distance_{wheel.name}", abs(wheel.lever)
-        design[name] = length
-        deviation = tolerance.radius * (length or robot.reach)
-        columns.append(({name: math.copysign(deviation, wheel.lever)}, {name: deviation}))
+        vary(tolerance.radius * (length or robot.reach), {name: math.copysign(1.0, wheel.lever)}, name, length)
     for wheel in on_rollers:
         name = f"angle_{wheel.name}"
-        design[name] = wheel.axle
-        columns.append(({name: tolerance.elements}, {name: tolerance.elements}))
+        vary(tolerance.elements, {name: 1.0}, name, wheel.axle)
 
     # Zeros of steering angles: the matrix of a car has their mean.
     for owner in robot.drive.steered:
-        name = f"steering_zero_{owner}"
-        design[name] = 0.0
-        changes = {"offset": STEERING_ZERO / len(robot.drive.steered)} if car else {f"offset_{owner}": STEERING_ZERO}
-        columns.append((changes, {name: STEERING_ZERO}))
+        changes = {"offset": 1 / len(robot.drive.steered)} if car else {f"offset_{owner}": 1.0}
+        vary(STEERING_ZERO, changes, f"steering_zero_{owner}")
 
     # The tracked point. Where all wheels slide it could be anywhere, by other distances, and its yaw is the angles':
     # there it stands where the file says, unless it is fitted.
@@ -366,18 +542,13 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
     if robot.slides and not robot.skid:
         mount = {name: TRACKED_POINT for name in ("mount_x", "mount_y") if fitted_mount}
     for name, deviation in mount.items():
-        if fitted_mount:
-            design[name] = at_design[name]
-        columns.append(({name: deviation}, {name: deviation} if fitted_mount else {}))
+        vary(deviation, {name: 1.0}, name if fitted_mount else "", at_design[name])
 
     for name in of_effects:
         design.setdefault(name, 1.0 if name.startswith("steering_gain") else at_design.get(name, 0.0))
 
-    spread, reported = np.zeros((len(at_design), len(columns))), np.zeros((len(design), len(columns)))
-    for column, (changes, shown) in enumerate(columns):
-        for rows, named, table in ((list(at_design), changes, spread), (list(design), shown, reported)):
-            for name, change in named.items():
-                table[rows.index(name), column] = change
+    spread = np.array([[changes.get(name, 0.0) for changes, _ in columns] for name in at_design])
+    reported = np.array([[shown.get(name, 0.0) for _, shown in columns] for name in design])
     return _ClassModel(geometry, spread, design, reported)
 
 

@@ -232,11 +232,10 @@ class SignalStream:
         sample_period: float,
         session: str | None = None,
         session_time: float = 0.0,
-        pose: Array | None = None,
         needs: Collection[str] = (),
     ) -> None:
         self.matrix = matrix
-        self.pose = pose
+        self.pose: Array | None = None
         self.robot, self._session, self._session_time = robot, session, session_time
         self._share = smoothing_share(sample_period)
         self._elapsed = self._way = 0.0

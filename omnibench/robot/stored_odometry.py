@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from omnibench.robot.odometry import Complex, Integration, OdometryBatch, RunSam
 
 Sampled = TypeVar("Sampled", bound=Any)  # a log, or a run
 Value = TypeVar("Value")
-Result = TypeVar("Result", covariant=True)
 
 # Samples up to which an OdometryBatch holds them, in 0.1 kB each of three wheels (chosen: beyond, reading them anew and
 # summing in compiled code takes a tenth of the time, too).
@@ -47,25 +46,20 @@ def poses_of_runs(logs: Sequence[WheelLog], matrix: Array, integration: Integrat
     return split_by(StoredOdometry(logs, integration).poses(matrix[None])[0], [log.stamps for log in logs])
 
 
-class FunctionOfRuns(Protocol[Result]):
-    """What ``of_runs`` computes of the odometry of some logs."""
-
-    def __call__(self, odometry: OdometryBatch, logs: Sequence[WheelLog], *arguments: Any) -> Result: ...
-
-
 def of_runs(
-    function: FunctionOfRuns[Value], logs: Sequence[WheelLog], integration: Integration, *arguments: Any
+    function: Callable[..., Value], logs: Sequence[WheelLog], integration: Integration, *arguments: Any
 ) -> list[Value]:
-    """Results of a function, from the top of a module, for each log, or for parts of very many, in the logs' order."""
+    """Results of a function, from the top of a module, for each log, or for parts of very many, in the logs' order.
+
+    function: takes the odometry of some logs, these logs, and the arguments.
+    """
     if not are_many(logs):
         return [function(OdometryBatch([log], integration), [log], *arguments) for log in logs]
     tasks = [(function, part, integration, arguments) for part in together(logs)]
     return gathered(workers(), _of_part, tasks)
 
 
-def _of_part(
-    task: tuple[FunctionOfRuns[Value], Sequence[WheelLog], Integration, tuple[Any, ...]], _: Reporter
-) -> Value:
+def _of_part(task: tuple[Callable[..., Value], Sequence[WheelLog], Integration, tuple[Any, ...]], _: Reporter) -> Value:
     function, logs, integration, arguments = task
     return function(StoredOdometry(logs, integration), logs, *arguments)
 
@@ -205,36 +199,25 @@ class StoredOdometry(OdometryBatch):
 
 def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, bool], _: Reporter) -> list[AtStamps]:
     """The sums of some logs for some matrices. The task: logs, matrices, integration, and whether slopes are wanted."""
+    from omnibench.robot.compiled import path_sums  # numba, which only very many samples need
+
     logs, matrices, integration, slopes = task
     parts = []
     for part in together(logs):
-        samples = RunSamples.of([log.times for log in part])
-        signals = np.ascontiguousarray(np.concatenate([log.signals for log in part]))
-        stamps = [log.stamps for log in part]
-        parts.append([_sums(samples, signals, stamps, matrix, integration, slopes) for matrix in matrices])
+        samples, signals = RunSamples.of([log.times for log in part]), np.concatenate([log.signals for log in part])
+        edges = np.cumsum([0, *(len(log.stamps) for log in part)])
+        stamps, count, size = np.concatenate([log.stamps for log in part]), int(edges[-1]), signals.shape[1]
+        sums = []
+        for matrix in matrices:
+            moved, driven = np.empty((count, 2)), np.empty((count, size))
+            rows = np.empty((2, count if slopes else 1, size), dtype=complex)
+            path_sums(
+                samples.times, np.ascontiguousarray(signals), samples.edges, stamps, edges,
+                np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
+            )  # fmt: skip
+            sums.append(AtStamps(moved, driven, rows.view(float) if slopes else None))
+        parts.append(sums)
     return _joined(parts)
-
-
-def _sums(
-    samples: RunSamples,
-    signals: Array,
-    stamps: Sequence[Array],
-    matrix: Array,
-    integration: Integration,
-    slopes: bool,
-) -> AtStamps:
-    """The sums of runs for one matrix. signals (F, M): of all runs. stamps: those of each run."""
-    edges = np.cumsum([0, *map(len, stamps)])
-    count, size = int(edges[-1]), signals.shape[1]
-    moved, driven = np.empty((count, 2)), np.empty((count, size))
-    rows = np.empty((2, count if slopes else 1, size), dtype=complex)
-    from omnibench.robot.compiled import path_sums  # numba, which only very many samples need
-
-    path_sums(
-        samples.times, signals, samples.edges, np.concatenate(stamps), edges,
-        np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
-    )  # fmt: skip
-    return AtStamps(moved, driven, rows.view(float) if slopes else None)
 
 
 def _joined(parts: Sequence[Sequence[AtStamps]]) -> list[AtStamps]:

@@ -1,20 +1,57 @@
-"""Wheel logs of what a user gives: arrays, a run, or a table of one run or several."""
+"""Arrays and tables that a user gives, and wheel logs of these: of arrays, a run, or a table of one run or several."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from omnibench.errors import DataError
-from omnibench.robot.arrays import finite_array, frame_of
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 
+if TYPE_CHECKING:
+    import polars as pl
+
 _ORIGIN = (0.0, 0.0, 0.0)
+
+
+def finite_array(name: str, values: ArrayLike, dimensions: int) -> Array:
+    """An array of finite numbers. DataError names it, and the row (1 is the first) of what is wrong."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise DataError(f"{name}: expected numbers, in rows of one length") from None
+    if array.ndim != dimensions or not array.size:
+        axes = "(rows,)" if dimensions == 1 else "(rows, columns)"
+        raise DataError(f"{name} has shape {array.shape}, expected {axes}")
+    for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
+        raise DataError(f"{name}, row {row + 1}: it holds a value that is missing or infinite")
+    return array
+
+
+def frame_of(name: str, content: Any) -> pl.DataFrame:
+    """A data frame or a dict of columns as a Polars frame. DataError names the table and the column that is unfit."""
+    import polars as pl  # takes longer than all that imports this module
+
+    if isinstance(content, pl.DataFrame):
+        return content
+    names = content if isinstance(content, Mapping) else getattr(content, "columns", None)  # as pandas has them
+    if names is None:
+        raise DataError(f"{name}: expected a data frame or a dict of arrays, found {type(content).__name__}")
+    arrays = {str(column): np.atleast_1d(np.asarray(content[column])) for column in names}
+    for column, array in arrays.items():
+        first = next(iter(arrays))
+        if array.ndim != 1:
+            raise DataError(f"{name}: column {column!r} has shape {array.shape}; give a column for each wheel or axis")
+        if len(array) != len(arrays[first]):
+            raise DataError(f"{name}: column {column!r} has {len(array)} rows, {first!r} has {len(arrays[first])}")
+    return pl.DataFrame(
+        {column: array.tolist() if array.dtype == object else array for column, array in arrays.items()}, strict=False
+    )
 
 
 def log_of_arrays(

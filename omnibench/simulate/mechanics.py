@@ -1,6 +1,6 @@
 """Mechanics of a simulated robot behind effects of steering, casters and grip, on code of its own.
 
-The effects that find these in recordings (robot/effects/steering.py, wheels.py, drift.py) are to first order and
+The effects that find these in recordings (robot/effects/textbook.py) are to first order and
 see samples only. Here a flank of the gear pushes the wheel, a lag is a differential equation, and a caster is drawn
 along by its pivot:
 

@@ -18,7 +18,7 @@ from omnibench.errors import DataError
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.kinematics import Array, Mount, Robot, compose, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath, WheelLog
+from omnibench.robot.odometry import PathBatch, RunSamples, WheelLog
 from omnibench.simulate.commands import STEADY, Command, TimedCommand, Variation, straight_and_pivot, wheels_of
 from omnibench.simulate.config import FlowerConfig, RobotConfig, RobotSession, Session
 from omnibench.simulate.floor_plan import FloorPlan, make_plan
@@ -192,8 +192,8 @@ def simulate_robot(
         twist = command.twist if mount is None else mount.twist @ command.twist
         for session in sessions.values() if command.speed else ():
             times = np.linspace(0.0, session.distance / command.speed, max(2, math.ceil(session.distance / _STEP)))
-            path = DrivenPath(times[-1:], plan.start, times[-1] * twist[None], "arc")
-            plan.check_path(_places(path.poses(times), mount), times, config.radius, f"command {command.name}")
+            path = PathBatch(RunSamples.of([times[-1:]]), plan.start[None], times[-1] * twist[None], "arc")
+            plan.check_path(_places(path.poses([times])[0], mount), times, config.radius, f"command {command.name}")
     truth = true_record(config, name)
     robot = truth.true_robot(TRUE_STEP)
     runs: list[_Recorded] = []

@@ -15,6 +15,7 @@ import pytest
 from clean_logs import checked
 from commands import run_here
 from config_robots import experiment
+from driven_path import DrivenPath
 from hypothesis import example, given
 from hypothesis import strategies as st
 from wheeled_samples import TRICYCLE, driven
@@ -26,7 +27,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.references import Reference, References
 from omnibench.fit.evaluate import command_names
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath, WheelLog
+from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.source import simulate_dataset
 
 Change = Callable[[Trajectory], Trajectory]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from driven_path import DrivenPath
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_robots import APR_02, fixed, make_robot
@@ -19,7 +20,7 @@ from omnibench.data.references import unwrap
 from omnibench.data.runs import align
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath, WheelLog
+from omnibench.robot.odometry import WheelLog
 
 ROBOT = make_robot("base", fixed("l", 0.0, 0.1), fixed("r", 0.0, -0.1))
 OFFSET, DRIFT = 0.12, 0.002  # s, s per s, to be added to the poses' times

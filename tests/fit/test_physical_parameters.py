@@ -13,9 +13,8 @@ from wheeled_recordings import PERIOD, recorded
 
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.fit.calibrate import CalibrationRun, calibrate
-from omnibench.robot.geometry import Geometry
 from omnibench.robot.kinematics import Array, Mount, Robot
-from omnibench.robot.physical import PhysicalParameter
+from omnibench.robot.physical import Geometry, PhysicalParameter
 from omnibench.testing.synthetic import synthetic_robot
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused
+from driven_path import DrivenPath
 from effect_samples import (
     EVERY,
     MOTION,
@@ -35,10 +36,10 @@ from omnibench.robot import corrections
 from omnibench.robot.calibration import EffectTerm, extended_model, read_calibration, write_calibration
 from omnibench.robot.effects.effect import MOST_BYTES, MotionEffect, Stage, Values, decode_weights, make_term
 from omnibench.robot.effects.learned import unpacked
-from omnibench.robot.export.c_header import c_header
+from omnibench.robot.export.formats import export_calibration
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath, Integration, OdometryStream, WheelLog, advance
+from omnibench.robot.odometry import Integration, OdometryStream, WheelLog, advance
 from omnibench.robot.signals import Signals, SignalStream, signals_of, smoothing_share
 
 BOTH: tuple[Integration, ...] = ("euler", "arc")
@@ -398,7 +399,7 @@ def test_a_file_holds_the_weights_and_a_c_header_says_that_they_are_left_out(tmp
     assert again == calibration
     log = a_drive(4)
     np.testing.assert_array_equal(again.model.poses([log])[0], calibration.model.poses([log])[0])
-    assert f"learned (share 1, {len(PACKED)} weights)" in " ".join(c_header(calibration, "apr")[1])
+    assert f"learned (share 1, {len(PACKED)} weights)" in " ".join(export_calibration(calibration, "c_header").warnings)
     assert "weights" not in EffectTerm(name="heading_drift", parameters={"b": 0.0}).model_dump()
 
 

@@ -12,9 +12,8 @@ from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRIC
 from scipy.special import stdtrit
 
 from omnibench.robot.calibration import EffectTerm
-from omnibench.robot.geometry import Geometry, physical_tolerance
 from omnibench.robot.kinematics import Array, Mount, Robot, published_matrix
-from omnibench.robot.physical import PhysicalParameter, PhysicalReading, read_matrix
+from omnibench.robot.physical import Geometry, PhysicalParameter, PhysicalReading, physical_tolerance, read_matrix
 
 # Names of the parameters of each class, in the order in which they are shown.
 ANGLES = ("front_left", "front_right", "rear_left", "rear_right")

@@ -13,8 +13,7 @@ from wheeled_samples import driven
 
 from omnibench.data.storage import tables_of
 from omnibench.errors import DataError, UnknownNameError
-from omnibench.robot.calibration import EffectTerm
-from omnibench.robot.dead_reckoning import odometry
+from omnibench.robot.calibration import EffectTerm, odometry
 from omnibench.robot.kinematics import Robot
 
 

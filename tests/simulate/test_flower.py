@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 from commands import refused
 from config_robots import NAMES, QUIET, apr02, apr02_settings, experiment, robot, settings
+from driven_path import DrivenPath
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -26,7 +27,6 @@ from omnibench.progress import Progress
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array, Mount, Robot, moved_to, published_matrix, wheel_equations
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import DrivenPath
 from omnibench.simulate import mechanics
 from omnibench.simulate.commands import Command, Variation
 from omnibench.simulate.config import FlowerConfig

@@ -21,7 +21,7 @@ from omnibench.fit import estimate, loss
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators import map as module
 from omnibench.registry import calibrators, load_plugins
-from omnibench.robot import geometry
+from omnibench.robot import physical as geometry
 from omnibench.robot.kinematics import class_of
 from omnibench.study.config import MethodChoice, TrainingChoice
 from omnibench.study.study import read_study_config

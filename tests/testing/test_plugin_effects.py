@@ -97,7 +97,7 @@ def test_a_calibration_without_its_plugin_is_refused_in_one_line(command: Comman
 def test_export_certify_and_swap_say_what_becomes_of_the_effect(command: Command, work: Path, extended: Path) -> None:
     known = ("--plugins", work / "plugins")
     exported = succeeded(command("export", extended, "--to", "c_header", *known))
-    assert "effects of the calibration are left out: drag" in exported.stderr
+    assert "other effects are left out: drag" in exported.stderr
     assert_refused(command("certify", extended, work / "data", *known), "has effects (drag)")
     # swap knows it before it asks for a node
     assert_refused(command("swap", "apr", extended, "--connect", "tcp/127.0.0.1:1", *known), "nothing listens there")

@@ -23,8 +23,7 @@ from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.calibration_report import parameter_table, path_table
 from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
-from omnibench.robot.export.c_header import left_out
-from omnibench.robot.export.formats import export_calibration
+from omnibench.robot.export.formats import export_calibration, left_out
 from omnibench.robot.kinematics import relative_deviations
 from omnibench.words import plural
 

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from omnibench.data.delimited import read_numbers
 from omnibench.errors import DataError
 from omnibench.files import write_text
-from omnibench.robot.arrays import Array, finite_array
+from omnibench.robot.kinematics import Array
+from omnibench.robot.wheel_logs import finite_array
 from omnibench.views import Brief
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")

@@ -94,12 +94,12 @@ def _smooth(
 
 
 def _elapsed(paths: Paths) -> Iterator[Basis]:
-    effect, shapes = smooth.SmoothElapsedTime(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
+    effect, shapes = smooth.smooth_elapsed_time(), {"duration": max(float(paths.signals.elapsed.max()), _SMALL)}
     yield _of_effect(effect, "the time since the start of a run", _smooth(effect, shapes, _ORDERS), shapes)
 
 
 def _heading() -> Iterator[Basis]:
-    heading, course = smooth.SmoothHeading(), smooth.SmoothCourse()
+    heading, course = smooth.smooth_heading(), smooth.SmoothCourse()
     yield _of_effect(heading, "the robot's heading", _smooth(heading))
 
     def steady_and_course(along: Paths) -> Array:
@@ -115,7 +115,7 @@ def _place(paths: Paths) -> Iterator[Basis]:
     area = area_of(places)
     if area["reach"] < _SMALL:
         return
-    floor, bent, patch = smooth.SmoothPlace(), smooth.SmoothMap(), smooth.SmoothPatch()
+    floor, bent, patch = smooth.smooth_place(), smooth.SmoothMap(), smooth.smooth_patch()
     yield _of_effect(floor, "where on the floor the robot is", _smooth(floor, area), area)
 
     bent_map = _by_parameters(bent, paths, area)
@@ -162,7 +162,7 @@ def patches_on_grid(places: Array, along: int) -> Iterator[dict[str, float]]:
 def _order(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis]:
     time = paths.signals.session_time
     if time is not None and len(paths.logs) > 3:  # any three times lie on a parabola
-        effect, shapes = smooth.SmoothOrderOfRuns(), {"duration": max(float(time.max()), _SMALL)}
+        effect, shapes = smooth.smooth_order_of_runs(), {"duration": max(float(time.max()), _SMALL)}
         columns = _smooth(effect, shapes, _ORDERS)
         yield _of_effect(effect, "the time since the start of the session", columns, shapes, stage="wheel")
     sessions = list(dict.fromkeys(run.session for run in trajectories))
@@ -263,7 +263,7 @@ def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis
         return
     number = {name: index for index, name in enumerate(names)}
     commands = np.array([-1 if run.command is None else number[run.command] for run in trajectories])
-    of_samples, effect, count = commands[paths.owner], smooth.SmoothCommand(), len(names)
+    of_samples, effect, count = commands[paths.owner], smooth.smooth_command(), len(names)
     order = np.argsort(of_samples, kind="stable")
     ends = np.searchsorted(of_samples[order], np.arange(count + 1))
     motions = np.array(
@@ -287,7 +287,7 @@ def _command(paths: Paths, trajectories: Sequence[Trajectory]) -> Iterator[Basis
 
 def _near_motions(paths: Paths, motions: Array) -> Iterator[dict[str, float]]:
     """Centre and width of a bump about each of several motions (n, 3), which ends before the nearest other motion."""
-    at_wheels = motions * [1.0, 1.0, smooth.lever(paths.robot)]
+    at_wheels = motions * [1.0, 1.0, paths.robot.reach]
     away = np.linalg.norm(at_wheels[:, None] - at_wheels, axis=2) + np.diag(np.full(len(motions), np.inf))
     least = _SMALL + _NARROW * float(np.linalg.norm(at_wheels, axis=1).max())
     for (forward, left, turn), nearest in zip(motions.tolist(), away.min(axis=1).tolist(), strict=True):

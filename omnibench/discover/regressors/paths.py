@@ -23,9 +23,9 @@ from scipy.sparse import csr_array
 
 from omnibench.errors import PluginError
 from omnibench.registry import effects
-from omnibench.robot.effects.drift import ReferenceTimeOffset
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, correction_of
 from omnibench.robot.effects.smooth import MODES, BentMap, SmoothEffect, direction
+from omnibench.robot.effects.textbook import ReferenceTimeOffset
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import PathBatch, RunSamples, WheelLog
 from omnibench.robot.signals import Signals, signals_of_runs

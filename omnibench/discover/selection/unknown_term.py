@@ -34,7 +34,7 @@ from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.discover.selection.model_selection import CHANCE, Screening
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
-from omnibench.robot.effects.smooth import SmoothJoint
+from omnibench.robot.effects.smooth import smooth_joint
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
 
@@ -186,7 +186,7 @@ def surest_bases(screening: Screening, base: Extended, left: Significance, covar
             of_stages.setdefault(group.basis.stage, []).append(group)
     found = [_together(screening.data, groups, before, price) for groups in of_stages.values()]
     for term, fine in of_terms.items():
-        if term == SmoothJoint.name:
+        if term == smooth_joint.name:
             best = min(fine, key=left.surest.index)
             found.append([left.groups[best]] if left.p_value(best) < CHANCE else [])
         else:

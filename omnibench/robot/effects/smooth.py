@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.wheels import EachWheelEffect, has_rollers, of_wheels
+from omnibench.robot.effects.effect import MotionEffect, Need, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.textbook import EachWheelEffect, has_rollers, of_wheels
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals, needed
 
@@ -29,10 +29,12 @@ MODES = {
     "rotation": "of the rate of turn",
 }
 ALL_MODES = tuple(MODES)
+_WITHOUT_ROTATION = ("along", "across", "turn")
 SURFACES = ("x", "y", "xx", "xy", "yy", "xxx", "xxy", "xyy", "yyy")
 HARMONICS = (0.5, *(float(number) for number in range(1, 17)), 1.5, 2.5, 3.5)  # waves in a turn of a wheel; chosen
 KNOTS = 8  # knots of the function of each wheel's rate; chosen
 _COMMON_KNOTS = 33  # knots of the function that all wheels share; chosen
+_WAVE = ("cos", "sin")
 _TURNS = ("cos1", "sin1", "cos2", "sin2", "cos3", "sin3")
 _AXES = {"x": "m", "y": "m", "theta": "rad"}
 _LARGEST = 0.1  # plausible size of a coefficient, a share of the motion; chosen
@@ -59,6 +61,7 @@ LINE = (
     scale("normal", "rad", -7.0, 7.0, 0.0, "direction across the line, in the reference's frame"),
     scale("distance", "m", -1e6, 1e6, 0.0, "of the line from the reference's origin along that direction"),
 )
+_SESSION = scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen")
 _TOP = scale("top", "rad/s", 1e-6, 1e6, 6.0, "the fastest rate that was seen; knots are spread from -top to top")
 
 
@@ -82,13 +85,8 @@ def direction(mode: str, signals: Signals) -> Array:
     elif mode == "rotation":
         changes[:, 2] = twists[:, 2]
     else:
-        changes[:, 2] = np.abs(twists[:, 2]) + signals.speed / lever(signals.robot)
+        changes[:, 2] = np.abs(twists[:, 2]) + signals.speed / signals.robot.reach
     return changes
-
-
-def lever(robot: Robot) -> float:
-    """Mean lever arm of the wheels, m, which converts turning to speed at the wheels."""
-    return robot.reach
 
 
 def waves(angle: Array, harmonics: Sequence[float]) -> Array:
@@ -96,16 +94,16 @@ def waves(angle: Array, harmonics: Sequence[float]) -> Array:
     return np.concatenate([[np.cos(multiple * angle), np.sin(multiple * angle)] for multiple in harmonics]).T
 
 
-def surfaces(inside: Array) -> Array:
-    """The nine monomials (F, 9) of degree 1 to 3 in x and y of points (F, 2)."""
-    x, y = inside.T
-    return np.column_stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
-
-
-def inside_of(places: Array, values: Values) -> Array:
+def _inside_of(places: Array, values: Values) -> Array:
     """Positions (F, 2) relative to the centre, in units of the reach; those beyond 1 are moved to the unit circle."""
     away = (places - [values["centre_x"], values["centre_y"]]) / values["reach"]
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1.0)
+
+
+def surfaces(places: Array, values: Values) -> Array:
+    """The nine monomials (F, 9) of degree 1 to 3 in x and y of positions (F, 2), held beyond the reach."""
+    x, y = _inside_of(places, values).T
+    return np.column_stack([x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
 
 
 def bump(places: Array, values: Values) -> Array:
@@ -133,22 +131,28 @@ class WithoutCause:
     in_catalogue = False
 
 
-class SmoothEffect(WithoutCause, MotionEffect):
-    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions.
+class Covariate(NamedTuple):
+    """A quantity on which an error may depend: its name among residuals, words for parameters, and what it needs."""
 
-    covariate: in words. scales: parameters that set the ranges of the functions. fixed_parameters: by default the
-    coefficients ``<mode>_<label>`` and the scales.
-    """
+    shows_in: str
+    words: str
+    needs: frozenset[Need] = frozenset()
+
+
+TIME = Covariate("elapsed time", "the time since the start")
+SESSION_TIME = Covariate("order of runs", "the session's time", frozenset({"session_time"}))
+HEADING = Covariate("heading", "the heading", frozenset({"poses"}))
+PLACE = Covariate("place", "the place", frozenset({"poses"}))
+ACROSS_A_LINE = PLACE._replace(words="the line")
+MOTION = Covariate("command", "the motion")
+
+
+class SmoothEffect(WithoutCause, MotionEffect):
+    """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
 
     stage = "body"
-    modes: ClassVar[tuple[str, ...]] = ("along", "across", "turn")
-    labels: ClassVar[tuple[str, ...]] = ()
-    covariate: ClassVar[str] = ""
-    scales: ClassVar[tuple[Parameter, ...]] = ()
-
-    def __init_subclass__(cls) -> None:
-        if "fixed_parameters" not in vars(cls):
-            cls.fixed_parameters = (*shared(cls.modes, cls.labels, cls.covariate), *cls.scales)
+    modes: ClassVar[tuple[str, ...]]
+    labels: ClassVar[tuple[str, ...]]
 
     @abstractmethod
     def shares(self, signals: Signals, values: Values) -> Array:
@@ -163,89 +167,64 @@ class SmoothEffect(WithoutCause, MotionEffect):
         return added
 
 
-class _SmoothWave(SmoothEffect):
-    """A wave whose phase depends on a covariate."""
+def smooth_effect(
+    covariate: Covariate, labels: Sequence[str], *scales: Parameter, modes: Sequence[str] = ALL_MODES
+) -> Callable[[Callable[[Signals, Values], Array]], type[SmoothEffect]]:
+    """Decorator: a function that computes ``shares`` of signals becomes the smooth effect of its name.
 
-    modes = ALL_MODES
-    labels = ("cos", "sin")
+    scales: parameters that set the ranges of the functions; the coefficients ``<mode>_<label>`` stand before them.
+    """
 
-    @abstractmethod
-    def phase(self, signals: Signals, values: Values) -> Array:
-        """Phase (F,), rad."""
+    def register(function: Callable[[Signals, Values], Array]) -> type[SmoothEffect]:
+        members = {
+            "__module__": function.__module__,
+            "__doc__": function.__doc__,
+            "shows_in": covariate.shows_in,
+            "needs": covariate.needs,
+            "modes": tuple(modes),
+            "labels": tuple(labels),
+            "fixed_parameters": (*shared(modes, labels, covariate.words), *scales),
+            "shares": lambda _, signals, values: function(signals, values),
+        }
+        effect: type[SmoothEffect] = type(function.__name__, (SmoothEffect,), members)
+        return effects.register(function.__name__)(effect)
 
-    def shares(self, signals: Signals, values: Values) -> Array:
-        return waves(self.phase(signals, values), (1.0,))
-
-
-class _SmoothFloor(SmoothEffect):
-    """Changes that depend on the place on the floor."""
-
-    shows_in = "place"
-    needs = frozenset({"poses"})
-    modes = ALL_MODES
-    covariate = "the place"
-
-    @abstractmethod
-    def functions(self, places: Array, values: Values) -> Array:
-        """Values (F, J) of the J functions at positions (F, 2), m."""
-
-    def shares(self, signals: Signals, values: Values) -> Array:
-        return self.functions(needed(signals.poses)[:, :2], values)
+    return register
 
 
-@effects.register("smooth_elapsed_time")
-class SmoothElapsedTime(SmoothEffect):
+@smooth_effect(
+    TIME,
+    [str(order) for order in range(16)],
+    scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
+    modes=_WITHOUT_ROTATION,
+)
+def smooth_elapsed_time(signals: Signals, values: Values) -> Array:
     """Unknown effect: cosines of the time since the start of a run; after the longest run seen the value is held."""
-
-    shows_in = "elapsed time"
-    covariate = "the time since the start"
-    labels = tuple(str(order) for order in range(16))
-    scales = (scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),)
-
-    def shares(self, signals: Signals, values: Values) -> Array:
-        part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
-        return np.cos(np.pi * np.arange(len(self.labels)) * part[:, None])
+    part = np.clip(signals.elapsed / values["duration"], 0.0, 1.0)
+    return np.cos(np.pi * np.arange(16) * part[:, None])
 
 
-@effects.register("smooth_time_wave")
-class SmoothTimeWave(_SmoothWave):
+@smooth_effect(
+    TIME,
+    _WAVE,
+    scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
+    scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
+)
+def smooth_time_wave(signals: Signals, values: Values) -> Array:
     """Unknown effect: a wave of the time since the start of a run; after the longest run seen the value is held."""
-
-    shows_in = "elapsed time"
-    covariate = "the time since the start"
-    scales = (
-        scale("frequency", "Hz", 1e-6, 1e6, 1.0, "waves in a second"),
-        scale("duration", "s", 1e-3, 1e6, 5.0, "of the longest run that was seen"),
-    )
-
-    def phase(self, signals: Signals, values: Values) -> Array:
-        return values["frequency"] * (2 * np.pi * np.minimum(signals.elapsed, values["duration"]))
+    return waves(values["frequency"] * (2 * np.pi * np.minimum(signals.elapsed, values["duration"])), (1.0,))
 
 
-@effects.register("smooth_heading")
-class SmoothHeading(SmoothEffect):
+@smooth_effect(HEADING, _TURNS, modes=_WITHOUT_ROTATION)
+def smooth_heading(signals: Signals, values: Values) -> Array:  # noqa: ARG001
     """Unknown effect: the first three harmonics of the robot's heading."""
-
-    shows_in = "heading"
-    needs = frozenset({"poses"})
-    covariate = "the heading"
-    labels = _TURNS
-
-    def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
-        return waves(needed(signals.poses)[:, 2], (1, 2, 3))
+    return waves(needed(signals.poses)[:, 2], (1, 2, 3))
 
 
-@effects.register("smooth_heading_wave")
-class SmoothHeadingWave(_SmoothWave):
+@smooth_effect(HEADING, _WAVE, scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"))
+def smooth_heading_wave(signals: Signals, values: Values) -> Array:
     """Unknown effect: a wave of the robot's heading, so many times a turn."""
-
-    shows_in = "heading"
-    needs = frozenset({"poses"})
-    covariate = "the heading"
-    scales = (scale("harmonic", "1", 1.0, 64.0, 4.0, "waves in a turn of the robot"),)
-
-    def phase(self, signals: Signals, values: Values) -> Array:
-        return values["harmonic"] * needed(signals.poses)[:, 2]
+    return waves(values["harmonic"] * needed(signals.poses)[:, 2], (1.0,))
 
 
 @effects.register("smooth_course")
@@ -257,11 +236,12 @@ class SmoothCourse(SmoothEffect):
 
     shows_in = "heading"
     needs = frozenset({"poses"})
+    modes = _WITHOUT_ROTATION
     labels = _TURNS[:4]
     fixed_parameters = (
         Parameter("east", "1", -_LARGEST, _LARGEST, "push along x of the reference, of the speed"),
         Parameter("north", "1", -_LARGEST, _LARGEST, "push along y of the reference, of the speed"),
-        *shared(SmoothEffect.modes, labels, "the direction of travel"),
+        *shared(modes, labels, "the direction of travel"),
     )
 
     def shares(self, signals: Signals, values: Values) -> Array:  # noqa: ARG002
@@ -278,123 +258,77 @@ class SmoothCourse(SmoothEffect):
         return added
 
 
-@effects.register("smooth_place")
-class SmoothPlace(_SmoothFloor):
+@smooth_effect(PLACE, SURFACES, *AREA, modes=_WITHOUT_ROTATION)
+def smooth_place(signals: Signals, values: Values) -> Array:
     """Unknown effect: polynomials of degree 3 in the place on the floor; beyond the places seen the value is held."""
-
-    modes = SmoothEffect.modes
-    labels = SURFACES
-    scales = AREA
-
-    def functions(self, places: Array, values: Values) -> Array:
-        return surfaces(inside_of(places, values))
+    return surfaces(needed(signals.poses)[:, :2], values)
 
 
-@effects.register("smooth_patch")
-class SmoothPatch(_SmoothFloor):
+@smooth_effect(PLACE, ("bump",), *PATCH)
+def smooth_patch(signals: Signals, values: Values) -> Array:
     """Unknown effect: a round patch of the floor, outside of which the change fades to zero."""
-
-    labels = ("bump",)
-    scales = PATCH
-
-    def functions(self, places: Array, values: Values) -> Array:
-        return bump(places, values)
+    return bump(needed(signals.poses)[:, :2], values)
 
 
-@effects.register("smooth_place_wave")
-class SmoothPlaceWave(_SmoothFloor):
+@smooth_effect(
+    PLACE,
+    _WAVE,
+    scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
+    scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
+    *AREA,
+)
+def smooth_place_wave(signals: Signals, values: Values) -> Array:
     """Unknown effect: a plane wave over the floor, as of tiles; beyond the places seen the value is held."""
-
-    labels = ("cos", "sin")
-    scales = (
-        scale("along_x", "rad/m", -1e3, 1e3, 10.0, "phase per way along x of the reference"),
-        scale("along_y", "rad/m", -1e3, 1e3, 0.0, "phase per way along y of the reference"),
-        *AREA,
-    )
-
-    def functions(self, places: Array, values: Values) -> Array:
-        held = values["reach"] * inside_of(places, values)
-        return waves(held @ [values["along_x"], values["along_y"]], (1.0,))
+    held = values["reach"] * _inside_of(needed(signals.poses)[:, :2], values)
+    return waves(held @ [values["along_x"], values["along_y"]], (1.0,))
 
 
-@effects.register("smooth_edge")
-class SmoothEdge(_SmoothFloor):
+@smooth_effect(ACROSS_A_LINE, ("beyond",), *LINE, scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"))
+def smooth_edge(signals: Signals, values: Values) -> Array:
     """Unknown effect: the floor beyond a straight line, as a carpet's edge."""
-
-    covariate = "the line"
-    labels = ("beyond",)
-    scales = (*LINE, scale("width", "m", 1e-6, 1e6, 0.05, "over which the change sets in"))
-
-    def functions(self, places: Array, values: Values) -> Array:
-        return beyond(places, values)
+    return beyond(needed(signals.poses)[:, :2], values)
 
 
-@effects.register("smooth_joint")
-class SmoothJoint(_SmoothFloor):
+@smooth_effect(
+    ACROSS_A_LINE,
+    ("joint",),
+    *LINE,
+    scale("width", "m", 1e-6, 1e6, 0.03, "across the joint, where 1/e of the change is left on either side"),
+)
+def smooth_joint(signals: Signals, values: Values) -> Array:
     """Unknown effect: a joint of the floor along a straight line, as between two rows of tiles."""
-
-    covariate = "the line"
-    labels = ("joint",)
-    scales = (
-        *LINE,
-        scale("width", "m", 1e-6, 1e6, 0.03, "across the joint, where 1/e of the change is left on either side"),
-    )
-
-    def functions(self, places: Array, values: Values) -> Array:
-        return np.exp(-np.square(across(places, values) / values["width"]))[:, None]
+    return np.exp(-np.square(across(needed(signals.poses)[:, :2], values) / values["width"]))[:, None]
 
 
-@effects.register("smooth_command")
-class SmoothCommand(SmoothEffect):
+@smooth_effect(
+    MOTION,
+    ("bump",),
+    scale("vx", "m/s", -1e3, 1e3, 0.2, "the motion, forwards"),
+    scale("vy", "m/s", -1e3, 1e3, 0.0, "the motion, to the left"),
+    scale("omega", "rad/s", -1e3, 1e3, 0.0, "the motion, turning"),
+    scale("width", "m/s", 1e-9, 1e3, 0.3, "how far other motions are, at the wheels, where 61 % of it is left"),
+    modes=_WITHOUT_ROTATION,
+)
+def smooth_command(signals: Signals, values: Values) -> Array:
     """Unknown effect: motions near one, by direction of travel and turning; for all others the change fades to zero."""
-
-    shows_in = "command"
-    covariate = "the motion"
-    labels = ("bump",)
-    scales = (
-        scale("vx", "m/s", -1e3, 1e3, 0.2, "the motion, forwards"),
-        scale("vy", "m/s", -1e3, 1e3, 0.0, "the motion, to the left"),
-        scale("omega", "rad/s", -1e3, 1e3, 0.0, "the motion, turning"),
-        scale("width", "m/s", 1e-9, 1e3, 0.3, "how far other motions are, at the wheels, where 61 % of it is left"),
-    )
-
-    def shares(self, signals: Signals, values: Values) -> Array:
-        away = signals.twists - [values["vx"], values["vy"], values["omega"]]
-        away = away * [1.0, 1.0, lever(signals.robot)] / values["width"]
-        return np.exp(-np.square(away).sum(axis=1, keepdims=True) / 2)
+    away = signals.twists - [values["vx"], values["vy"], values["omega"]]
+    away = away * [1.0, 1.0, signals.robot.reach] / values["width"]
+    return np.exp(-np.square(away).sum(axis=1, keepdims=True) / 2)
 
 
-@effects.register("smooth_session_wave")
-class SmoothSessionWave(_SmoothWave):
+@smooth_effect(SESSION_TIME, _WAVE, scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"), _SESSION)
+def smooth_session_wave(signals: Signals, values: Values) -> Array:
     """Unknown effect: a wave of the time since the session's start; after the longest seen the value is held."""
-
-    shows_in = "order of runs"
-    needs = frozenset({"session_time"})
-    covariate = "the session's time"
-    scales = (
-        scale("frequency", "Hz", 1e-9, 1e6, 1e-3, "waves in a second"),
-        scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),
-    )
-
-    def phase(self, signals: Signals, values: Values) -> Array:
-        return values["frequency"] * (2 * np.pi * np.minimum(needed(signals.session_time), values["duration"]))
+    time = np.minimum(needed(signals.session_time), values["duration"])
+    return waves(values["frequency"] * (2 * np.pi * time), (1.0,))
 
 
-@effects.register("smooth_order_of_runs")
-class SmoothOrderOfRuns(SmoothEffect):
+@smooth_effect(SESSION_TIME, [str(order) for order in range(1, 13)], _SESSION, modes=("along", "rotation", "turn"))
+def smooth_order_of_runs(signals: Signals, values: Values) -> Array:
     """Unknown effect: polynomials of the time since the session's start; after the longest seen the value is held."""
-
-    shows_in = "order of runs"
-    needs = frozenset({"session_time"})
-    covariate = "the session's time"
-    modes = ("along", "rotation", "turn")
-    labels = tuple(str(order) for order in range(1, 13))
-    scales = (scale("duration", "s", 1e-3, 1e9, 3600.0, "of the longest session that was seen"),)
-
-    def shares(self, signals: Signals, values: Values) -> Array:
-        unit = np.clip(2 * needed(signals.session_time) / values["duration"] - 1, -1.0, 1.0)
-        functions: Array = chebyshev.chebvander(unit, len(self.labels))[:, 1:]
-        return functions
+    unit = np.clip(2 * needed(signals.session_time) / values["duration"] - 1, -1.0, 1.0)
+    functions: Array = chebyshev.chebvander(unit, 12)[:, 1:]
+    return functions
 
 
 def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
@@ -430,36 +364,43 @@ def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
     return added
 
 
+def _of_radius(largest: float, angle: str = "") -> tuple[Parameter, ...]:
+    """The parameters a and b of a wheel whose radius changes with an angle."""
+    return tuple(
+        Parameter(name, "1", -largest, largest, f"share of the radius, with the {function}{angle}")
+        for name, function in (("a", "cosine"), ("b", "sine"))
+    )
+
+
+class _WheelWave(EachWheelEffect):
+    """A wave of each wheel's angle, with ``harmonic`` waves in a turn."""
+
+    shows_in = "wheel angle"
+    needs = frozenset({"wheel_angles"})
+    harmonic: ClassVar[str] = ""
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return ripple(signals, values[self.harmonic] if self.harmonic else 1.0, values)
+
+
 @effects.register("wheel_eccentricity")
-class WheelEccentricity(EachWheelEffect):
+class WheelEccentricity(_WheelWave):
     """A wheel's radius changes over one turn: r (1 + a cos phi + b sin phi)."""
 
     physics = "The axle does not stand in the middle of the wheel."
     source = "first principles"
-    shows_in = "wheel angle"
-    needs = frozenset({"wheel_angles"})
-    for_each_wheel = (
-        Parameter("a", "1", -0.02, 0.02, "share of the radius, with the cosine of the angle"),
-        Parameter("b", "1", -0.02, 0.02, "share of the radius, with the sine of the angle"),
-    )
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return ripple(signals, 1.0, values)
+    for_each_wheel = _of_radius(0.02, " of the angle")
 
 
 @effects.register("roller_ripple")
-class RollerRipple(EachWheelEffect):
+class RollerRipple(_WheelWave):
     """A wheel's radius changes from roller to roller: r (1 + a cos(n phi) + b sin(n phi)), n rollers."""
 
     physics = "The rollers do not make a perfect circle: the wheel sinks in between two of them."
     source = "first principles"
-    shows_in = "wheel angle"
-    needs = frozenset({"wheel_angles"})
+    harmonic = "rollers"
     only_for = "robots with a wheel on rollers"
-    for_each_wheel = (
-        Parameter("a", "1", -0.03, 0.03, "share of the radius, with the cosine of n angles"),
-        Parameter("b", "1", -0.03, 0.03, "share of the radius, with the sine of n angles"),
-    )
+    for_each_wheel = _of_radius(0.03, " of n angles")
     fixed_parameters = (
         Parameter("rollers", "1", 2, 64, "rollers along a wheel's circumference, n", tuple(map(float, range(3, 17)))),
     )
@@ -467,8 +408,14 @@ class RollerRipple(EachWheelEffect):
     def applies(self, robot: Robot) -> bool:
         return has_rollers(robot)
 
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return ripple(signals, values["rollers"], values)
+
+@effects.register("smooth_wheel_angle")
+class SmoothWheelAngle(WithoutCause, _WheelWave):
+    """Unknown effect: a wave of each wheel's angle, so many times a turn."""
+
+    harmonic = "harmonic"
+    for_each_wheel = _of_radius(0.03)
+    fixed_parameters = (Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),)
 
 
 def hat_functions(rates: Array, top: float) -> Array:
@@ -518,22 +465,6 @@ class SmoothCommonRate(WithoutCause, MotionEffect):
     def correction(self, signals: Signals, values: Values) -> Array:
         heights = np.array([values[f"change_{knot}"] for knot in range(_COMMON_KNOTS)])
         return _between_knots(signals.rates, values["top"], heights)
-
-
-@effects.register("smooth_wheel_angle")
-class SmoothWheelAngle(WithoutCause, EachWheelEffect):
-    """Unknown effect: a wave of each wheel's angle, so many times a turn."""
-
-    shows_in = "wheel angle"
-    needs = frozenset({"wheel_angles"})
-    for_each_wheel = (
-        Parameter("a", "1", -0.03, 0.03, "share of the radius, with the cosine"),
-        Parameter("b", "1", -0.03, 0.03, "share of the radius, with the sine"),
-    )
-    fixed_parameters = (Parameter("harmonic", "1", 0.1, 256.0, "waves in a turn of the wheel", choices=HARMONICS),)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return ripple(signals, values["harmonic"], values)
 
 
 @effects.register("smooth_acceleration")
@@ -621,10 +552,10 @@ class SmoothMap(BentMap):
     """Unknown effect: a bent map, by polynomials of degree 3 in the place; beyond the places seen the value is held."""
 
     labels = SURFACES
-    fixed_parameters = (*_shifts(SURFACES), *AREA)
+    fixed_parameters = (*_shifts(labels), *AREA)
 
     def functions(self, places: Array, values: Values) -> Array:
-        return surfaces(inside_of(places, values))
+        return surfaces(places, values)
 
 
 @effects.register("smooth_map_patch")

@@ -20,25 +20,55 @@ import numpy as np
 
 from omnibench.errors import ConfigError, UnknownNameError, one_line, require_type
 from omnibench.robot.calibration import Calibration, Noise
-from omnibench.robot.export.c_header import c_header
-from omnibench.robot.export.ros2_controllers import (
-    Parameter,
-    RemainingError,
-    controller,
-    covariance_parameters,
-    interval_in_words,
-    matrix_deviations,
-    pose_variances,
-    ros2_controllers,
-    to_node,
-)
-from omnibench.robot.kinematics import Mount
+from omnibench.robot.effects.textbook import KNEE
+from omnibench.robot.export import ros2_controllers
+from omnibench.robot.export.ros2_controllers import Parameter, RemainingError, interval_in_words, to_node
+from omnibench.robot.kinematics import CarDrive, Mount
 from omnibench.views import Brief
 
 # m2/s and rad2/s, then as often per s2 and s4: x, y, z, roll, pitch, yaw, their velocities, accelerations. The
 # package's defaults (params/ekf.yaml), but for x, y and yaw.
 _PROCESS_NOISE = (0.0, 0.0, 0.06, 0.03, 0.03, 0.0, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.01, 0.01, 0.015)
 _FUSED = (6, 7, 11)  # of these: velocities along x and y, and of yaw
+_IN_HEADER = {"steering_gain": "g", "steering_offset": "c", "wheel_dead_zone": "c"}  # effects that the C header applies
+
+
+@dataclass(frozen=True, repr=False)
+class Export(Brief):
+    """The text of an exported file, a warning for everything left out, and a name for the file."""
+
+    text: str
+    warnings: tuple[str, ...]
+    file_name: str
+
+
+def _ros2_controllers(calibration: Calibration) -> Export:
+    """The controller's parameters as YAML with comments. ConfigError: no controller can describe this robot."""
+    fitted = ros2_controllers.controller(calibration.robot, calibration.matrix_without_effects)
+    design = ros2_controllers.controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
+    warnings = ros2_controllers.warnings_of(calibration, fitted, design)
+    values = [
+        f"{parameter.name} {ros2_controllers.number(parameter.value, 6)}"
+        for parameter in design.parameters
+        if isinstance(parameter.value, float)
+    ]
+    head = _comments(
+        calibration, f"{fitted.name} (ros2_controllers)", "closest to", warnings, f"Design values: {', '.join(values)}"
+    )
+    parameters = (*fitted.parameters, *ros2_controllers.covariance_parameters(calibration, fitted))
+    stem = f"{_stem(calibration.name)}_{fitted.name.removesuffix('_controller')}"
+    return Export(head + to_node(fitted.name, parameters), warnings, f"{stem}.yaml")
+
+
+def _comments(calibration: Calibration, what: str, relation: str, warnings: tuple[str, ...], last: str) -> str:
+    """The comment above parameters: what they are of, the warnings, and a last line."""
+    lines = [
+        f"{what} for robot {one_line(calibration.robot.name)!r},",
+        f"{relation} the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
+        *(f"- {warning}" for warning in warnings),
+        last,
+    ]
+    return "".join(f"# {line}\n" for line in lines)
 
 
 def robot_localization(calibration: Calibration) -> Export:
@@ -47,11 +77,11 @@ def robot_localization(calibration: Calibration) -> Export:
     ConfigError: the calibration has no noise model.
     """
     try:
-        publisher = controller(calibration.robot, calibration.matrix_without_effects)
+        publisher = ros2_controllers.controller(calibration.robot, calibration.matrix_without_effects)
     except ConfigError:
         publisher = None
     base = Mount() if publisher is None else publisher.base
-    noise, growth = calibration.noise, pose_variances(calibration, base)
+    noise, growth = calibration.noise, ros2_controllers.pose_variances(calibration, base)
     if noise is None or growth is None:
         raise ConfigError(
             f"robot_localization: calibration {calibration.name!r} has no noise model, of which covariances are made; "
@@ -59,33 +89,35 @@ def robot_localization(calibration: Calibration) -> Export:
         )
     warnings = _warnings(calibration, noise, base)
     along_x, along_y, heading = np.sqrt(growth).tolist()
-    lines = [
-        f"robot_localization for robot {one_line(calibration.robot.name)!r},",
-        f"from the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
-        *(f"- {warning}" for warning in warnings),
+    head = _comments(
+        calibration,
+        "robot_localization",
+        "from",
+        warnings,
         f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
         f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
-    ]
-    fused = ("true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE)))
-    process_noise = ",\n      ".join(
-        ", ".join(str(value) if column == row else "0.0" for column in range(len(_PROCESS_NOISE)))
-        for row, value in enumerate(_PROCESS_NOISE)
     )
+    process_noise = ",\n      ".join(", ".join(map(str, row)) for row in np.diag(_PROCESS_NOISE).tolist())
     node = (
         Parameter("two_d_mode", "true"),
         Parameter("odom0", "/odom" if publisher is None else f"/{publisher.name}/{publisher.topic}"),
-        Parameter("odom0_config", tuple(fused), "vx, vy, vyaw: velocities only"),
+        Parameter(
+            "odom0_config",
+            tuple("true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE))),
+            "vx, vy, vyaw: velocities only",
+        ),
         Parameter("odom0_differential", "false"),
         Parameter("process_noise_covariance", f"[{process_noise}]"),
     )
-    text = "".join(f"# {line}\n" for line in lines) + to_node("ekf_filter_node", node)
-    file_name = f"{_stem(calibration.name)}_robot_localization.yaml"
     if publisher is not None:
-        text += to_node(publisher.name, covariance_parameters(calibration, publisher))
-        return Export(text, warnings, file_name)
-    along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
-    text += f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
-    return Export(text, warnings, file_name)
+        covariances = to_node(publisher.name, ros2_controllers.covariance_parameters(calibration, publisher))
+    else:
+        along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
+        covariances = (
+            f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
+        )
+    file_name = f"{_stem(calibration.name)}_robot_localization.yaml"
+    return Export(head + to_node("ekf_filter_node", node) + covariances, warnings, file_name)
 
 
 def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
@@ -100,7 +132,7 @@ def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str,
             f"the recordings show no random walk of {' and '.join(unseen)}: its variance is 0 here, which the filter "
             "takes as 1e-9; put in a larger one"
         )
-    deviations = matrix_deviations(calibration, base)
+    deviations = ros2_controllers.matrix_deviations(calibration, base)
     if deviations is None:
         warnings.append("the calibration has no covariance of its matrix: how far that may be off is not known")
         return tuple(warnings)
@@ -118,24 +150,66 @@ def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str,
     return tuple(warnings)
 
 
-@dataclass(frozen=True, repr=False)
-class Export(Brief):
-    """The text of an exported file, a warning for everything left out, and a name for the file."""
-
-    text: str
-    warnings: tuple[str, ...]
-    file_name: str
-
-
-def _ros2_controllers(calibration: Calibration) -> Export:
-    text, warnings, controller = ros2_controllers(calibration)
-    return Export(text, warnings, f"{_stem(calibration.name)}_{controller.removesuffix('_controller')}.yaml")
-
-
 def _c_header(calibration: Calibration) -> Export:
-    stem = _stem(calibration.name)
-    text, warnings = c_header(calibration, stem)
-    return Export(text, warnings, f"{stem}_odometry.h")
+    """A self-contained C99 header: the matrix and one step of the odometry, made of the template odometry.h.j2."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # slow to import
+
+    robot, prefix = calibration.robot, _stem(calibration.name)
+    templates = Environment(
+        loader=PackageLoader(__package__, "."),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= {
+        # A C literal that is read as exactly the same double
+        "literal": lambda value: text if "." in (text := f"{float(value):.17g}") or "e" in text else f"{text}.0",
+        "quoted": lambda names: ", ".join(f'"{name}"' for name in names),
+        "in_comment": lambda text: " ".join(text.split()).replace("*/", "* /"),
+    }
+    plain = _header_is_plain(calibration)
+    held = {
+        name: 0 if plain else sum(term.parameters[parameter] for term in calibration.effects if term.name == name)
+        for name, parameter in _IN_HEADER.items()
+    }
+    text = templates.get_template("odometry.h.j2").render(
+        calibration=calibration,
+        left_out=left_out(calibration),
+        prefix=prefix,
+        upper=prefix.upper(),
+        drive=robot.drive,
+        ahead=float(np.mean(robot.drive.ahead, axis=0)[0]) if isinstance(robot.drive, CarDrive) else None,
+        matrix=(calibration.matrix_without_effects if plain else calibration.matrix_array).tolist(),
+        counter_clockwise=all(wheel.lever > 0 for wheel in robot.measured),
+        lost=held["wheel_dead_zone"],
+        knee=KNEE,
+        gain=1 + held["steering_gain"],
+        zero=held["steering_offset"],
+    )
+    warnings = []
+    if omitted := left_out(calibration):
+        warnings.append(
+            "it holds the matrix, a steering's gain and zero, and lost rates; other effects are left out: "
+            f"{omitted}; the matrix was fitted with{'out' if plain else ''} them"
+        )
+    elif calibration.plain is not None and calibration.driven is not None:
+        warnings.append("its effects do not fade beyond what was driven; there, errors may be larger than stated")
+    if robot.mount is not None:
+        warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
+    return Export(text, tuple(warnings), f"{prefix}_odometry.h")
+
+
+def _header_is_plain(calibration: Calibration) -> bool:
+    """True if the C header holds the plain matrix and no effects: some of these it cannot hold."""
+    return calibration.plain is not None and any(term.name not in _IN_HEADER for term in calibration.effects)
+
+
+def left_out(calibration: Calibration) -> str:
+    """The effects that the C header does not hold, in words, and "" if there are none: a live node has them."""
+    plain = _header_is_plain(calibration)
+    others = tuple(term for term in calibration.effects if plain or term.name not in _IN_HEADER)
+    return calibration.model_copy(update={"effects": others}).effects_in_words
 
 
 EXPORT_FORMATS: Mapping[str, Callable[[Calibration], Export]] = MappingProxyType(

@@ -1,7 +1,7 @@
 """The controller of ros2_controllers for a robot, with the parameters that come closest to its calibration.
 
 ``controller`` takes the controller of the robot's kind and computes its parameters in closed form; the equations stand
-at each. ``ros2_controllers`` writes them as YAML, with warnings of what the controller cannot hold of the calibration.
+at each. ``warnings_of`` says what the controller cannot hold of the calibration.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omnibench.errors import ConfigError, one_line
+from omnibench.errors import ConfigError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, CarDrive, Mount, Robot
 from omnibench.robot.paths import legs_of, usual_paths, wheel_log
@@ -90,29 +90,6 @@ class RemainingError:
         )
 
 
-def ros2_controllers(calibration: Calibration) -> tuple[str, tuple[str, ...], str]:
-    """The controller's parameters as YAML with comments, warnings of what they cannot hold, and the controller's name.
-
-    ConfigError: no controller can describe this robot.
-    """
-    fitted = controller(calibration.robot, calibration.matrix_without_effects)
-    design = controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
-    warnings = _warnings(calibration, fitted, design)
-    values = [
-        f"{parameter.name} {_number(parameter.value, 6)}"
-        for parameter in design.parameters
-        if isinstance(parameter.value, float)
-    ]
-    lines = [
-        f"{fitted.name} (ros2_controllers) for robot {one_line(calibration.robot.name)!r},",
-        f"closest to the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
-        *(f"- {warning}" for warning in warnings),
-        f"Design values: {', '.join(values)}",
-    ]
-    parameters = (*fitted.parameters, *covariance_parameters(calibration, fitted))
-    return "".join(f"# {line}\n" for line in lines) + to_node(fitted.name, parameters), warnings, fitted.name
-
-
 def controller(robot: Robot, matrix: Array) -> Controller:
     """The controller of a robot, closest to a matrix (3, M) of its tracked point. ConfigError: there is none."""
     matrix = of_centre(robot, matrix)
@@ -126,7 +103,7 @@ def controller(robot: Robot, matrix: Array) -> Controller:
     return mecanum_drive(robot, matrix) if "mecanum" in kinds else omni_wheel_drive(robot, matrix)
 
 
-def _warnings(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, ...]:
+def warnings_of(calibration: Calibration, fitted: Controller, design: Controller) -> tuple[str, ...]:
     """Warnings of what the controller cannot hold. design: the same controller for the design values."""
     robot, base = calibration.robot, fitted.base
     true = base.twist @ of_centre(robot, calibration.matrix_without_effects)
@@ -189,16 +166,12 @@ def covariance_parameters(calibration: Calibration, controller: Controller) -> t
     pose = pose_variances(calibration, controller.base)
     if pose is None:
         return ()
-    quantities = (
-        ("pose", pose, "m2, rad2: what 1 s adds"),
-        (
-            "twist",
-            pose / calibration.sample_period,
-            f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}",
-        ),
-    )
+    per_message = f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}"
     parameters = []
-    for quantity, variances, comment in quantities:
+    for quantity, variances, comment in (
+        ("pose", pose, "m2, rad2: what 1 s adds"),
+        ("twist", pose / calibration.sample_period, per_message),
+    ):
         x, y, heading = (f"{value:.6e}" for value in variances.tolist())
         diagonal = (x, y, "0.0", "0.0", "0.0", heading)
         parameters.append(Parameter(controller.covariances.format(quantity), diagonal, comment))
@@ -215,7 +188,7 @@ def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
         opened = path
         value = parameter.value
         if isinstance(value, float):
-            value = _number(value, 12)
+            value = number(value, 12)
         elif isinstance(value, tuple):
             value = f"[{', '.join(value)}]"
         comment = f"  # {parameter.comment}" if parameter.comment else ""
@@ -223,7 +196,8 @@ def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float, decimals: int) -> str:
+def number(value: float, decimals: int) -> str:
+    """A number with so many decimals."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0
 
 

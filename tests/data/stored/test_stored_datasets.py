@@ -31,8 +31,7 @@ from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
 from omnibench.registry import costs
 from omnibench.robot.kinematics import Robot
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.samples import Samples
+from omnibench.robot.odometry import Samples, WheelLog
 
 
 def recorded(robot: Robot = APR_02, runs: int = 12) -> Dataset:

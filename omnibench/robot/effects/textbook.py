@@ -1,4 +1,9 @@
-"""Effects on wheels and tread, slip of the robot on its wheels, friction, and how wheels and the LIDAR are mounted."""
+"""Effects of the textbook: on wheels and tread, slip, friction, mounting, drift, clocks, steering, and motors.
+
+Drift is motion that the wheel rates do not show: while driving, at the start of a run, or relative to the floor.
+A driven wheel whose rate is measured and that steers has two signals, in which an offset of its angle is a change of
+the matrix. The wheels of a car that only steer have one, in which an offset is none beyond small angles.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +11,12 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Parameter, ReferenceEffect, Values, body_change
-from omnibench.robot.kinematics import Array, Robot, class_of
-from omnibench.robot.odometry import Complex
-from omnibench.robot.signals import Signals, needed
+from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Parameter, ReferenceEffect, Values, body_change
+from omnibench.robot.kinematics import Array, CarDrive, Robot, class_of
+from omnibench.robot.signals import STILL, Signals, needed
 
 _PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
 _BORENSTEIN = (
@@ -20,6 +25,14 @@ _BORENSTEIN = (
 _CENSI = (
     "A. Censi, A. Franchi, L. Marchionni and G. Oriolo, Simultaneous calibration of odometry and sensor parameters "
     "for mobile robots, 2013"
+)
+
+_FURGALE = (
+    "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
+)
+_KALLASI = (
+    "F. Kallasi, D. Lodi Rizzini, F. Oleari, M. Magnani and S. Caselli, A novel calibration method for industrial "
+    "AGVs, 2017"
 )
 
 _RADIUS_OF = "radius_"
@@ -328,20 +341,15 @@ class LidarLeverArm(ReferenceEffect):
     )
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:
-        return _shifted(poses, _arm(poses, start, values))
+        return _by_arm(poses, start, complex(values["x"], values["y"]))
 
     def corrected(self, poses: Array, start: Array, values: Values) -> Array:
-        return _shifted(poses, -_arm(poses, start, values))
+        return _by_arm(poses, start, -complex(values["x"], values["y"]))
 
 
-def _arm(poses: Array, start: Array, values: Values) -> Complex:
-    """Displacement of the tracked point by the arm's rotation since the start: x + iy (K,), m."""
-    arm: Complex = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * complex(values["x"], values["y"])
-    return arm
-
-
-def _shifted(poses: Array, shift: Complex) -> Array:
-    """Poses (K, 3) with positions displaced by x + iy (K,), m."""
+def _by_arm(poses: Array, start: Array, arm: complex) -> Array:
+    """Poses (K, 3) displaced by the rotation of a lever arm x + iy, m, since the start."""
+    shift = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * arm
     return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
 
 
@@ -456,3 +464,296 @@ class DrivenSteeringOffset(MotionEffect):
     def correction(self, signals: Signals, values: Values) -> Array:
         offsets = [values.get(f"c_{name}", 0.0) for name in signals.robot.drive.steered]
         return np.tile(offsets, (len(needed(signals.steering)), 1))
+
+
+def _driving(rates: Array) -> NDArray[np.bool_]:
+    """True for samples (F,) in which a wheel turns."""
+    driving: NDArray[np.bool_] = np.abs(rates).max(axis=1) > STILL
+    return driving
+
+
+@effects.register("heading_drift")
+class HeadingDrift(MotionEffect):
+    """The robot turns a little all the time while it drives: w + b."""
+
+    stage = "body"
+    physics = "Something pulls to one side whatever the command: a dragged cable, a bent wheel, a drifting reference."
+    source = "first principles"
+    shows_in = "elapsed time"
+    fixed_parameters = (Parameter("b", "rad/s", -0.005, 0.005, "rate of turn that is added while a wheel turns"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return body_change(signals, turning=values["b"] * _driving(signals.rates))
+
+
+@effects.register("body_velocity_bias")
+class BodyVelocityBias(MotionEffect):
+    """The robot moves a little in its own frame all the time while it drives: v + b."""
+
+    stage = "body"
+    physics = "Something pulls the robot the same way whatever the command: a dragged cable, rollers that shake it on."
+    source = "first principles"
+    shows_in = "elapsed time"
+    fixed_parameters = (
+        Parameter("bx", "m/s", -0.005, 0.005, "velocity forward that is added while a wheel turns"),
+        Parameter("by", "m/s", -0.005, 0.005, "velocity to the left that is added while a wheel turns"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return _driving(signals.rates)[:, None] * np.array([values["bx"], values["by"], 0.0])
+
+
+@effects.register("start_transient")
+class StartTransient(MotionEffect):
+    """The robot falls behind at the start of a run: v (1 - k exp(-s / length)), s the way since it stood."""
+
+    stage = "body"
+    physics = "Play has to be taken up and rollers have to align themselves before the wheels drive the robot in full."
+    source = "first principles"
+    shows_in = "elapsed time"
+    form_covariates = ("distance",)
+    fixed_parameters = (
+        Parameter("k", "1", -0.2, 0.2, "share of the velocity that is lost at first"),
+        Parameter(
+            "length", "m", 1e-3, 10, "way over which it comes back by a factor of e", (0.03, 0.05, 0.1, 0.2, 0.4)
+        ),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        lost = values["k"] * np.exp(-signals.travelled / values["length"])
+        return body_change(signals, velocity=-lost[:, None] * signals.twists[:, :2])
+
+
+@effects.register("caster_pull")
+class CasterPull(MotionEffect):
+    """A caster that swings round takes the robot along: w + k times the rate of its swing.
+
+    The caster stands as far behind the centre as the wheels beside it, and has a trail of 5 cm (signals.py). The side
+    to which it swings is that of the turn; where the robot goes straight back, it is chance, and nothing is added.
+    """
+
+    stage = "body"
+    physics = "Friction in a caster's swivel, and of its tread on the floor, turns the robot while the caster swings."
+    source = (
+        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
+        "(internal forces by castor wheels)"
+    )
+    shows_in = "command"
+    needs = frozenset({"caster_rates"})
+    only_for = "differential drives, which casters hold up"
+    fixed_parameters = (Parameter("k", "1", -0.05, 0.05, "turn of the robot per turn of the caster"),)
+
+    def applies(self, robot: Robot) -> bool:
+        return class_of(robot) == "differential"
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return body_change(signals, turning=values["k"] * needed(signals.caster_rates))
+
+
+@effects.register("floor_drift")
+class FloorDrift(MotionEffect):
+    """The floor carries the robot the same way wherever it heads: v_world + d abs(v)."""
+
+    stage = "world"
+    physics = "The floor is tilted, or its pile lies one way, and the wheels slip towards there."
+    source = "first principles"
+    shows_in = "heading"
+    fixed_parameters = (
+        Parameter("dx", "1", -0.02, 0.02, "drift along x of the reference, as a share of the speed"),
+        Parameter("dy", "1", -0.02, 0.02, "drift along y of the reference, as a share of the speed"),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return signals.speed[:, None] * np.array([values["dx"], values["dy"]])
+
+
+@effects.register("reference_time_offset")
+class ReferenceTimeOffset(ReferenceEffect):
+    """Every pose was taken earlier than its stamp says: at t - tau."""
+
+    physics = "The reference's clock is off, or its poses are stamped when SLAM has finished: only the sum shows."
+    source = _FURGALE
+    shows_in = "acceleration"
+    fixed_parameters = (Parameter("tau", "s", -0.2, 0.2, "by how much earlier the pose was taken"),)
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        delay = np.full(stamps.shape, values["tau"])
+        return delay, delay
+
+
+@effects.register("heading_latency")
+class HeadingLatency(ReferenceEffect):
+    """The heading alone was taken earlier than its stamp says: at t - tau."""
+
+    physics = "The reference smooths its headings, or takes them from another sensor than its positions."
+    source = _FURGALE
+    shows_in = "acceleration"
+    fixed_parameters = (Parameter("tau", "s", -0.1, 0.1, "by how much earlier the heading was taken"),)
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        return np.zeros(stamps.shape), np.full(stamps.shape, values["tau"])
+
+
+@effects.register("reference_clock_drift")
+class ReferenceClockDrift(ReferenceEffect):
+    """The reference's clock has an offset and goes wrong, by its own amounts in every run: t - offset - slope t."""
+
+    physics = "The clocks of robot and reference were set independently and do not go at the same speed."
+    source = "E. Olson, A passive solution to the sensor synchronization problem, 2010"
+    shows_in = "stamps"
+    run_nuisance = True
+    fixed_parameters = (
+        Parameter("offset", "s", -0.2, 0.2, "by how much earlier the first pose was taken"),
+        Parameter("slope", "1", -0.01, 0.01, "by how much more for every second of the run"),
+    )
+
+    def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
+        delay = values["offset"] + values["slope"] * stamps
+        return delay, delay
+
+
+class _SteeringEffect(MotionEffect):
+    """An effect on the steering angles, the same for all of a robot's."""
+
+    stage = "steering"
+    only_for = "robots with a measured steering angle"
+
+    def applies(self, robot: Robot) -> bool:
+        return bool(robot.drive.steered)
+
+
+@effects.register("steering_gain")
+class SteeringGain(_SteeringEffect):
+    """Wheels steer by more than is measured, by a factor: phi (1 + g)."""
+
+    physics = "The ratio of the gear between the angle's encoder and the wheel, or of a linkage, is off."
+    source = _KALLASI
+    shows_in = "steering angle"
+    fixed_parameters = (Parameter("g", "1", -0.1, 0.1, "by how much the true angle is larger"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return values["g"] * needed(signals.steering)
+
+
+@effects.register("steering_play")
+class SteeringPlay(_SteeringEffect):
+    """Wheels stay behind when the steering turns back: phi - b s, s the side of the play, from -1 to 1.
+
+    The side changes over 20 mrad of the measured angle, and is not known (0) until the first turn of a run.
+    """
+
+    physics = "Gear and linkage have play between the angle's encoder and the wheel, and the floor holds the wheel."
+    source = "M. A. Krasnosel'skii and A. V. Pokrovskii, Systems with Hysteresis, 1989 (play operator)"
+    shows_in = "steering angle"
+    needs = frozenset({"steering_side"})
+    fixed_parameters = (Parameter("b", "rad", 0.0, 0.04, "half of the play"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return -values["b"] * needed(signals.steering_side)
+
+
+@effects.register("steering_lag")
+class SteeringLag(_SteeringEffect):
+    """Wheels follow the measured angle late: phi - tau d(phi)/dt; before it, where the angle is reported late."""
+
+    physics = "A linkage gives way under the torque that turns a wheel on the floor; or a bus delays the angle."
+    source = "first principles"
+    shows_in = "steering angle"
+    fixed_parameters = (Parameter("tau", "s", -0.2, 0.2, "time by which the wheel follows the measured angle"),)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return -values["tau"] * needed(signals.steering_rates)
+
+
+@effects.register("steering_offset")
+class SteeringOffset(_SteeringEffect):
+    """The wheels of a car do not point straight ahead where the measured angle is 0: phi + c."""
+
+    physics = "The zero of the steering was set by eye, or a linkage was bent or put together anew."
+    source = _KALLASI
+    shows_in = "steering angle"
+    only_for = "cars: on a driven wheel that steers, the matrix holds the offset"
+    fixed_parameters = (Parameter("c", "rad", -0.05, 0.05, "true angle where 0 is measured"),)
+
+    def applies(self, robot: Robot) -> bool:
+        return isinstance(robot.drive, CarDrive)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        return np.full(needed(signals.steering).shape, values["c"])
+
+
+@effects.register("steering_coupling")
+class SteeringCoupling(MotionEffect):
+    """Turning a module about its steering axis turns its drive encoder as well: omega + k d(phi)/dt."""
+
+    stage = "wheel"
+    physics = "The motor drives the wheel by a gear that runs round the steering axis, and rolls on it when it steers."
+    source = "CTRE Phoenix 6, SwerveModuleConstants.CouplingGearRatio"
+    shows_in = "steering angle"
+    only_for = "robots with a driven wheel that steers"
+    fixed_parameters = (
+        Parameter("k", "1", -0.5, 0.5, "turn of the wheel per turn of the module that is not measured"),
+    )
+
+    def applies(self, robot: Robot) -> bool:
+        return any(pair >= 0 for pair in robot.drive.pairs)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        pairs = np.array(signals.robot.drive.pairs)
+        return np.where(pairs < 0, 0.0, values["k"] * needed(signals.steering_rates)[:, pairs])
+
+
+@effects.register("motor_lag")
+class MotorLag(ActuatorEffect):
+    """Wheels follow their targets with a first-order lag."""
+
+    physics = "Inertia and a controller of finite bandwidth delay what was told."
+    source = "first principles"
+    shows_in = "acceleration"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("tau", "s", 0.0, 0.3, "time constant"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:
+        """Means over each sample of the exact solution for targets that are constant within samples."""
+        tau = values["tau"]
+        if tau <= 0:
+            return targets.copy()
+        from scipy.linalg.lapack import dtbtrs  # slow to import, and not needed by a live node
+
+        # Rates (F, N) at the beginning of each sample; remaining (F,): share of the distance to the target after one.
+        remaining = np.exp(-durations / tau)
+        begins = np.zeros(targets.shape)
+        if len(targets) > 1:
+            bands = np.ones((2, len(targets) - 1))
+            bands[1, :-1] = -remaining[1:-1]
+            begins[1:] = dtbtrs(bands, (1 - remaining[:-1, None]) * targets[:-1], uplo="L")[0]
+        mean_remaining = (-np.expm1(-durations / tau) * tau / durations)[:, None]
+        return targets + (begins - targets) * mean_remaining
+
+
+@effects.register("motor_dead_band")
+class MotorDeadBand(ActuatorEffect):
+    """Targets below a threshold do not move a wheel, and larger ones are reduced by it."""
+
+    physics = "Static friction takes a part of what drives the motor."
+    source = "H. Olsson et al., Friction models and friction compensation, 1998"
+    shows_in = "wheel rate"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("band", "rad/s", 0.0, 0.1, "half the width of the dead band"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:  # noqa: ARG002
+        return np.sign(targets) * np.maximum(np.abs(targets) - values["band"], 0.0)
+
+
+@effects.register("motor_gain")
+class MotorGain(ActuatorEffect):
+    """Wheels turn faster or slower than they were told, by a factor."""
+
+    physics = "The controller's scale of counts per turn, or its supply, is off."
+    source = "first principles"
+    shows_in = "wheel rate"
+    needs = frozenset({"targets"})
+    fixed_parameters = (Parameter("g", "1", -0.05, 0.05, "by how much wheels turn faster than they were told"),)
+
+    def driven(self, durations: Array, targets: Array, values: Values) -> Array:  # noqa: ARG002
+        return (1 + values["g"]) * targets
