@@ -357,8 +357,8 @@ def slam(
     """
     from omnibench.cli.terminal.recording_tables import print_slam
     from omnibench.config import parse_settings, validate
+    from omnibench.slam.slam_dataset import SlamRequest
     from omnibench.slam.slam_options import SlamOptions
-    from omnibench.slam.slam_request import SlamRequest
 
     shared.load_given_plugins(plugins)
     given: dict[str, Any] = {} if start is None else {"start": start}

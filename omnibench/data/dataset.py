@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
 from numbers import Real
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,21 +18,12 @@ from pydantic_core import to_jsonable_python
 
 from omnibench.config import Model
 from omnibench.data import stored
-from omnibench.data.references import (
-    NUMBERS,
-    TURN,
-    References,
-    nearest_turns,
-    reference_flaw,
-    references_of,
-    with_whole_turns,
-)
+from omnibench.data.references import NUMBERS, TURN, References, reference_flaw, references_of, unwrap, with_whole_turns
 from omnibench.data.scans import Scans
 from omnibench.data.stored import Flaw, Table
 from omnibench.errors import DataError, UnknownNameError, nearest, require_type
 from omnibench.robot.calibration import SAMPLE_PERIODS
 from omnibench.robot.kinematics import Array, Drive, Robot, interpolated
-from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Samples, WheelLog, digest_of, with_samples
 from omnibench.robot.wheel_logs import frame_of
 from omnibench.views import Shown
@@ -66,7 +55,6 @@ _MOST_PERIODS = 1001.0
 # Share of the runs whose headings are neither wrapped nor those of the wheels, from which on none is unwrapped (chosen:
 # in degrees most are such, in radians none); turns within which wrapped headings lie, with what rounding adds.
 _CONTRADICTED, _WITHIN = 0.25, 1.001
-_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
 _SHOWN = 5  # ids in a warning, at most
 _ONLY_RUN = "run"  # id of the run of tables without a column "trajectory"
 _PERIOD_DECIMALS = 9  # of a sample period in s that is taken from stamps: ns
@@ -301,10 +289,7 @@ def make_dataset(
     if wheels is None and (trajectories is None or poses is not None or references is not None):
         raise DataError(f"data set {name}: wheels is missing: a table with the columns t and omega_<wheel>")
     if wheels is not None and poses is None and references is None:
-        raise DataError(
-            f"data set {name}: poses is missing: a table with the columns t, x, y and theta; or references, with "
-            "distances, turns and the like"
-        )
+        raise DataError(f"data set {name}: poses is missing: a table with t, x, y and theta; or references (distances)")
     if not isinstance(sample_period, Real | None):
         raise DataError(f"data set {name}: sample_period is {sample_period!r}, expected a number of seconds")
     if wheels is None:
@@ -323,7 +308,7 @@ def make_dataset(
             listed = listed.with_columns(pl.Series("split", every_second(commands), dtype=pl.String))
         of_runs = check_runs(Table(Path("trajectories"), listed, required["trajectories"]))
         samples = stored.samples_in_memory(tables["wheels"], of_runs, robot)
-        runs = runs_of_tables(of_runs, samples, tables.get("poses"), tables.get("references"))
+        runs = runs_of_tables(of_runs, samples, tables)
     if sample_period is None:  # the median; that there is no run is said next
         sample_period = round(stored.median_period(runs), _PERIOD_DECIMALS) if runs else 1.0
     made = Dataset(name, robot, sample_period, tuple(runs), description, source, licence, simulated, scans=scans)
@@ -380,10 +365,9 @@ def check_runs(runs: Table) -> Table:
     for column in runs.frame.columns:
         if column in (*RUN_NUMBERS, "repetition"):
             values = runs.floats(column)
-            infinite = ~values.is_finite() & values.is_not_null()
-            runs.refuse(infinite, f"{column} is {{}}; leave it empty if it is not known", values)
-            fraction = (values % 1 != 0) if column == "repetition" else infinite
-            runs.refuse(fraction, f"{column} is {{}}, not a whole number", values)
+            runs.refuse(~values.is_finite(), f"{column} is {{}}; leave it empty if it is not known", values)
+            if column == "repetition":
+                runs.refuse(values % 1 != 0, "repetition is {}, not a whole number", values)
             runs.frame = runs.frame.with_columns(values.alias(column))
     ids, splits = runs.frame["trajectory"], runs.frame["split"]
     runs.refuse(~ids.is_first_distinct(), "trajectory {} is there twice; give each its own id", ids)
@@ -393,37 +377,28 @@ def check_runs(runs: Table) -> Table:
     return runs
 
 
-def runs_of_tables(
-    runs: Table,
-    samples: Sequence[Samples],
-    poses: Table | None,
-    references: Table | None,
-    commands: Table | None = None,
-) -> list[Trajectory]:
-    """The runs of a data set's tables. DataError names the table, the row and what is wrong.
+def runs_of_tables(runs: Table, samples: Sequence[Samples], tables: Mapping[str, Table]) -> list[Trajectory]:
+    """The runs of a data set's tables by name. DataError names the table, the row and what is wrong.
 
-    runs: see ``check_runs``. samples: of each run. poses: None where all runs have references. references: a row for
+    runs: see ``check_runs``. samples: of each run. poses: none where all runs have references. references: a row for
     each measurement of a run's motion, with columns trajectory, kind, value and sigma of kinds of one number, value_x,
     value_y, sigma_x and sigma_y of those of two (sigma stands for both where these are empty), t0 and t1, which may be
     missing or empty: the run's start and end; sigma_rate (rad/s) of a gyro's offset, which the turns of a session
     share. commands: the motion commands that were sent in runs, if they were recorded.
     """
+    poses, references, commands = (tables.get(name) for name in ("poses", "references", "commands"))
     started = set() if poses is None else set(poses.ids)
     measured: dict[str, References] = {}
     if references is not None:
         numbers = {name: np.full(len(references.frame), np.nan) for name in NUMBERS}
         for name in [name for name in NUMBERS if name in references.frame.columns]:
             numbers[name] = references.floats(name).fill_null(np.nan).to_numpy()
-            if name in ("t0", "t1"):
-                infinite = np.isinf(numbers[name])
-                references.refuse(infinite, f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
+            infinite = np.isinf(numbers[name])
+            references.refuse(infinite, f"{name} is {{}}; remove or repair the row", numbers[name].tolist())
         kinds = np.array(["" if kind is None else str(kind).strip() for kind in references.frame["kind"]], dtype=str)
         for index, rows in references.rows_by_run(runs.ids, runs.file.name):
-            run, of_rows, end = (
-                runs.ids[index],
-                {name: values[rows] for name, values in numbers.items()},
-                samples[index].end,
-            )
+            run, end = runs.ids[index], samples[index].end
+            of_rows = {name: values[rows] for name, values in numbers.items()}
             of_run = references_of(kinds[rows], of_rows, start_known=run in started).of_run(0.0, end)
             if (wrong := reference_flaw(of_run, end)) is not None:
                 raise references.fail(int(rows[wrong[0]]), wrong[1])
@@ -471,10 +446,9 @@ def checked(dataset: Dataset) -> Dataset:
         distances = np.linalg.norm(each.poses[:, :2] - each.poses[0, :2], axis=1)
         for row in np.flatnonzero(distances > _FARTHEST * (travel + 1.0))[:1]:
             x, y = each.poses[row, :2]
-            raise DataError(
-                f"{place}: trajectory {each.id}: the pose at {each.pose_times[row]:g} s, x {x:g} and y {y:g}, is "
-                f"{distances[row]:.3g} m from the run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
-            )
+            pose = f"the pose at {each.pose_times[row]:g} s, x {x:g} and y {y:g}, is {distances[row]:.3g} m from"
+            what = f"{pose} the run's start, whose wheels rolled {travel:.3g} m; remove or repair it"
+            raise DataError(f"{place}: trajectory {each.id}: {what}")
         moved = np.abs(each.poses - each.poses[0]).max(axis=0)
         if (far := moved > (_MOVED, _MOVED, _TURNED)).any():
             # The reference moves: do the wheels, by the design matrix, travel more than hardly any of it?
@@ -483,16 +457,12 @@ def checked(dataset: Dataset) -> Dataset:
             standing += [each.id] if driven.sum(axis=0).max() < _HARDLY * moved[far].max() else []
         each.samples.summarise()  # while they are at hand
     period, (shortest, longest) = stored.median_period(runs), SAMPLE_PERIODS
+    odd = f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
     if not period / _MOST_PERIODS < sample_period < period * _MOST_PERIODS:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the "
-            f"median); set it to {period:.3g}"
-        )
+        raise DataError(f"{place}: {odd}; set it to {period:.3g}")
     if not shortest <= sample_period <= longest:
-        raise DataError(
-            f"{place}: sample_period is {sample_period:g} s, expected {shortest:g} to {longest:g} s; "
-            "check the units of the times"
-        )
+        expected = f"expected {shortest:g} to {longest:g} s; check the units of the times"
+        raise DataError(f"{place}: sample_period is {sample_period:g} s, {expected}")
     recorded = [run.poses[:, 2] for run in runs]
     headings, ambiguous = unwrap(robot, [run.log(run.pose_times) for run in runs], recorded)
     # Wrapped headings lie within a turn, and continuous ones need no turns: others are in degrees, say.
@@ -501,31 +471,24 @@ def checked(dataset: Dataset) -> Dataset:
         for run, before, after in zip(runs, recorded, headings, strict=True)
         if np.ptp(before) > _WITHIN * TURN and not np.array_equal(before, after)
     ]
-    warnings = []
     if len(contradicted) > _CONTRADICTED * sum(run.has_poses for run in runs):
         headings, ambiguous, standing = recorded, [], []  # in other units runs seem to move too far
-        warnings.append(
-            f"headings of {plural(len(contradicted), 'trajectory')} turn otherwise than the wheels, so that all stay "
-            f"as they were recorded: {some(contradicted, _SHOWN)}"
-        )
-    if ambiguous:
-        warnings.append(
-            f"headings of {plural(len(ambiguous), 'trajectory')} may be unwrapped wrongly (reference too sparse): "
-            f"{some([runs[index].id for index in ambiguous], _SHOWN)}"
-        )
-    if 0 < len(standing) < moving:
-        warnings.append(
-            f"the reference moves in {plural(len(standing), 'trajectory')} though no wheel turns, which spoils every "
-            f"fit; leave {'it' if len(standing) == 1 else 'them'} out: {some(standing, _SHOWN)}"
-        )
+    else:
+        contradicted = []
     late = [run.id for run in runs if run.pose_times[-1] > run.samples.end * (1 + 1.5 / run.samples.count)]
-    if late:
-        have = "has reference poses after its" if len(late) == 1 else "have reference poses after their"
-        warnings.append(f"{plural(len(late), 'trajectory')} {have} last wheel sample, e.g. {some(late, _SHOWN)}")
+    concerned = {
+        "headings of {} turn otherwise than the wheels, so that all stay as they were recorded": contradicted,
+        "headings of {} may be unwrapped wrongly (reference too sparse)": [runs[index].id for index in ambiguous],
+        "the reference moves in {} though no wheel turns, which spoils every fit; leave them out": (
+            standing if len(standing) < moving else []
+        ),
+        "{} with reference poses after the last wheel sample": late,
+    }
+    warnings = [
+        f"{what.format(plural(len(ids), 'trajectory'))}: {some(ids, _SHOWN)}" for what, ids in concerned.items() if ids
+    ]
     if not 0.5 < period / sample_period < 2:
-        warnings.append(
-            f"sample_period is {sample_period:g} s, but the wheel samples come every {period:g} s (the median)"
-        )
+        warnings.append(odd)
     for index, (run, before, heading) in enumerate(zip(runs, recorded, headings, strict=True)):
         if heading is not before:  # poses that stay need no memory for a copy
             run = replace(run, poses=np.column_stack([run.poses[:, :2], heading]))
@@ -537,31 +500,9 @@ def checked(dataset: Dataset) -> Dataset:
 def with_warnings(dataset: Dataset, warnings: Iterable[str]) -> Dataset:
     """The data set with more warnings, each once, and with one about copies in its validation split."""
     warnings = list(dict.fromkeys([*dataset.warnings, *warnings]))
-    if copies := dataset.copies:
-        are = "is a copy of a training run and is" if len(copies) == 1 else "are copies of training runs and are"
-        warnings.append(f"{plural(len(copies), 'trajectory')} {are} left out of validation: {some(copies, _SHOWN)}")
+    if dataset.copies:
+        warnings.append(f"left out of validation, as copies of training runs: {some(dataset.copies, _SHOWN)}")
     return replace(dataset, warnings=tuple(warnings))
-
-
-def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
-
-    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
-    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
-    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
-    """
-    model = OdometryModel.of_design(robot, "arc")
-    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
-    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
-    odometries = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
-    unwrapped, ambiguous = list[Array](), list[int]()
-    for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
-        driven = odometry[:, 2]
-        continuous = nearest_turns(heading, driven)
-        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
-        if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
-            ambiguous.append(index)
-    return unwrapped, ambiguous
 
 
 def every_second(groups: Sequence[Hashable]) -> list[Split]:

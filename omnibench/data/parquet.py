@@ -5,10 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import polars as pl
 from polars.io.plugins import register_io_source
@@ -30,16 +30,31 @@ def readable(file: Path) -> Iterator[None]:
         raise DataError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def file_state(file: Path) -> tuple[int, int]:
-    """Time of change, ns, and size of a file, bytes. DataError: it cannot be read."""
-    with readable(file):
-        return file.stat().st_mtime_ns, file.stat().st_size
+class OpenedTable(NamedTuple):
+    """A table's file that is read in parts. state: its time of change, ns, and size, bytes, when it was opened."""
 
+    file: Path
+    state: tuple[int, int]
 
-def check_unchanged(file: Path, state: tuple[int, int]) -> None:
-    """DataError: a file is not in the state any more in which it was opened."""
-    if file_state(file) != state:
-        raise DataError(f"{file}: the file has changed since it was opened; load it, or run the command, again")
+    @classmethod
+    def of(cls, file: Path) -> OpenedTable:
+        """The file as it is now. DataError: it cannot be read."""
+        with readable(file):
+            return cls(file, (file.stat().st_mtime_ns, file.stat().st_size))
+
+    def rows(self, columns: Sequence[str], first: int = 0, count: int | None = None) -> pl.DataFrame:
+        """Some rows of columns, in CSV as text. DataError: unreadable, or changed since it was opened."""
+        if OpenedTable.of(self.file) != self:
+            changed = "the file has changed since it was opened; load it, or run the command, again"
+            raise DataError(f"{self.file}: {changed}")
+        with readable(self.file):
+            return self.lazy().select(columns).slice(first, count).collect()
+
+    def lazy(self) -> pl.LazyFrame:
+        """The table, unread."""
+        if self.file.suffix == ".parquet":
+            return pl.scan_parquet(self.file, glob=False)
+        return pl.scan_csv(self.file, infer_schema=False, glob=False)
 
 
 def parquet_shape(file: Path) -> tuple[int, pl.Schema]:
@@ -50,10 +65,8 @@ def parquet_shape(file: Path) -> tuple[int, pl.Schema]:
         rows, schema = int(scanned.select(pl.len()).collect().item()), scanned.collect_schema()
         size, packed = rows * len(schema) * 8, file.stat().st_size
     if size > _LARGE and size > _PACKED * packed:
-        raise DataError(
-            f"{file}: its {packed / 1e6:.3g} MB would unpack to {size / 1e9:.3g} GB ({rows:,} rows), as no recording "
-            "does; write it anew, or leave it out"
-        )
+        large = f"its {packed / 1e6:.3g} MB would unpack to {size / 1e9:.3g} GB ({rows:,} rows), as no recording does"
+        raise DataError(f"{file}: {large}; write it anew, or leave it out")
     return rows, schema
 
 
@@ -74,13 +87,6 @@ def scan_table(file: Path) -> tuple[int, pl.LazyFrame]:
             text = f"a text of {longest[0]:,} characters"
             raise DataError(f"{file}: column {longest.name!r} has {text}, expected names or numbers")
     return rows, frame
-
-
-def read_parquet(file: Path) -> pl.DataFrame:
-    """A whole Parquet file. DataError as for scan_table."""
-    _, frame = scan_table(file)
-    with readable(file):
-        return frame.collect()
 
 
 def seconds(place: int, kind: pl.DataType) -> pl.Expr:
@@ -113,7 +119,7 @@ def sink_frames(
                 table.sink_csv(opened, maintain_order=True)
             else:
                 table.sink_parquet(opened, row_group_size=rows, maintain_order=True)
-    except pl.exceptions.PolarsError as error:
+    except (pl.exceptions.PolarsError, OSError) as error:
         if number := re.search(r"\(os error (\d+)\)", str(error)):
             raise OSError(int(number[1]), os.strerror(int(number[1]))) from None
-        raise OSError(errno.EIO, str(error)) from None
+        raise (error if isinstance(error, OSError) else OSError(errno.EIO, str(error))) from None

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -23,9 +24,7 @@ KINDS: tuple[ReferenceKind, ...] = get_args(ReferenceKind)
 PLANAR: frozenset[str] = frozenset({"displacement", "position"})  # kinds of two numbers, x and y
 TURN = 2 * np.pi  # rad
 AT_ONE_TIME: frozenset[str] = frozenset({"position", "heading"})  # kinds of an instant, t1, where t0 is not given
-UNITS: Mapping[str, Literal["m", "rad"]] = MappingProxyType(
-    {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
-)
+UNITS: Mapping[str, Literal["m", "rad"]] = {kind: "rad" if kind in ("turn", "heading") else "m" for kind in KINDS}
 
 
 @dataclass(frozen=True)
@@ -79,16 +78,12 @@ class References(Brief):
         for each in given:
             require_type(each, Reference, "Reference(kind, value, sigma)")
         kinds = np.array([each.kind for each in given], dtype=str)
-        # As of a run to come: -inf is its start, inf its end, and in the place of t0 the same time as t1.
-        starts = [np.inf if each.kind in AT_ONE_TIME else -np.inf for each in given]
-        t0 = [start if each.t0 is None else each.t0 for each, start in zip(given, starts, strict=True)]
-        t1 = [np.inf if each.t1 is None else each.t1 for each in given]
-        pairs = [(np.resize(each.value, 2), np.resize(each.sigma, 2)) for each in given]  # one number stands for both
-        values, sigmas = np.array(pairs, dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
-        times = np.array([t0, t1], dtype=float)
-        measured = cls(kinds, times[0], times[1], values, sigmas, start_known, rate_sigma)
-        values[~measured.planar, 1] = sigmas[~measured.planar, 1] = np.nan
-        return measured.of_run(0.0, end).by_time()
+        times = np.array([(each.t0, each.t1) for each in given], dtype=float).reshape(-1, 2).T  # NaN for None
+        values = np.array([np.resize(each.value, 2) for each in given], dtype=float).reshape(-1, 2).T
+        sigmas = np.array([np.resize(each.sigma, 2) for each in given], dtype=float).reshape(-1, 2).T
+        rows = (*times, values[0], *values, sigmas[0], *sigmas, np.zeros(len(given)))  # one number stands for both
+        measured = references_of(kinds, dict(zip(NUMBERS, rows, strict=True)), start_known=start_known)
+        return replace(measured, rate_sigma=rate_sigma).of_run(0.0, end).by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -169,49 +164,39 @@ def reference_flaw(references: References, end: float | None) -> Flaw | None:
 
     end: of its wheel samples, s; None: whatever the times of the references are.
     """
+    return next(_flaws(references, end), None)
+
+
+def _flaws(references: References, end: float | None) -> Iterator[Flaw]:
     columns = (references.kinds, references.t0, references.t1, references.values, references.sigmas)
     for row, (kind, t0, t1, values, sigmas) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        if what := _flaw_of_row(kind, t0, t1, values, sigmas, end):
-            return row, what
-    if 0 <= references.rate_sigma <= LARGEST:
-        return None
-    return 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
-
-
-def _flaw_of_row(
-    kind: str, t0: float, t1: float, values: Sequence[float], sigmas: Sequence[float], end: float | None
-) -> str:
-    """What is wrong with a reference, its values and standard deviations (2,); empty if nothing is."""
-    if kind not in KINDS:
-        return f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
-    if end is not None:
-        for name, value in (("t0", t0), ("t1", t1)):
-            if not np.isfinite(value):
-                return f"{name} is {value}; remove or repair the row"
-            if value < 0:
-                return f"{name} is {value:g}; it must not be negative (s since the run's start)"
-        if t1 > end + LATE:
-            late = f"t1 is {t1:g}, after the run's last wheel sample at {end:g} s"
-            return f"{late}; check the clocks, or leave the row out"
-        if kind == "position" and t0 != t1:
-            return f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
-        if kind == "heading" and t0 not in (0.0, t1):
-            return f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn for one since t0"
-        if kind not in AT_ONE_TIME and t0 >= t1:
-            return f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
-    axes = ("_x", "_y") if kind in PLANAR else ("",)
-    for axis, value, sigma in zip(axes, values, sigmas, strict=False):
-        if np.isnan(value):
-            return f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
-        if np.isnan(sigma):
-            return f"sigma{axis} is missing: how exactly the {kind} is known, a standard deviation"
-        if not abs(value) <= LARGEST:
-            return f"value{axis} is {value:g}, which no robot can reach; check the units"
-        if not 0 < sigma <= LARGEST:
-            return f"sigma{axis} is {sigma:g}; a standard deviation is > 0 (how exactly the {kind} is known)"
-    if kind == "distance" and values[0] < 0:
-        return f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
-    return ""
+        if kind not in KINDS:
+            yield row, f"kind is {kind!r}; {nearest(kind, KINDS)}it must be one of {', '.join(KINDS)}"
+        if end is not None:
+            for name, value in (("t0", t0), ("t1", t1)):
+                if not 0 <= value < np.inf:
+                    yield row, f"{name} is {value:g}; s since the run's start, finite and not negative"
+            if t1 > end + LATE:
+                yield row, f"t1 is {t1:g}, after the wheels' end at {end:g} s; check the clocks, or leave the row out"
+            if kind == "position" and t0 != t1:
+                yield row, f"t0 is {t0:g} and t1 {t1:g}; a position is that at t1, leave t0 empty"
+            if kind == "heading" and t0 not in (0.0, t1):
+                yield row, f"t0 is {t0:g}; leave it empty for a heading in a fixed frame, or take kind turn"
+            if kind not in AT_ONE_TIME and t0 >= t1:
+                yield row, f"t0 is {t0:g} and t1 {t1:g}; a {kind} needs t0 < t1"
+        axes = ("_x", "_y") if kind in PLANAR else ("",)
+        for axis, value, sigma in zip(axes, values, sigmas, strict=False):
+            if np.isnan(value):
+                yield row, f"value{axis} is missing; a {kind} needs {' and '.join(f'value{name}' for name in axes)}"
+            if not abs(value) <= LARGEST:
+                yield row, f"value{axis} is {value:g}, which no robot can reach; check the units"
+            if not 0 < sigma <= LARGEST:
+                stated = "missing" if np.isnan(sigma) else f"{sigma:g}"
+                yield row, f"sigma{axis} is {stated}; a standard deviation is > 0 (how exactly the {kind} is known)"
+        if kind == "distance" and values[0] < 0:
+            yield row, f"value is {values[0]:g}; a distance driven is not negative, backwards or not"
+    if not 0 <= references.rate_sigma <= LARGEST:
+        yield 0, f"sigma_rate is {references.rate_sigma:g}; the standard deviation of a gyro's offset is >= 0, rad/s"
 
 
 def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> References:
@@ -224,14 +209,35 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     counted = (references.kinds == "heading") & ~absolute
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
-            wanted = WheelLog(
-                log.times, log.rates, np.zeros(3), references.t1[chosen], steering=log.steering, drive=log.drive
-            )
-            (poses,) = OdometryModel.of_design(robot, "arc").poses([wanted])
-            headings, driven = values[chosen, 0], poses[:, 2]  # rad, the latter since the start
-            start = (first, 0.0) if known else (headings[0], driven[0])
-            values[chosen, 0] = nearest_turns(np.append(start[0], headings), np.append(start[1], driven))[1:]
+            begin = [0.0] * known  # the run's start, where it is known
+            wanted = replace(log, start=np.zeros(3), stamps=np.append(begin, references.t1[chosen]))
+            (headings,), _ = unwrap(robot, [wanted], [np.append([first] * known, values[chosen, 0])])
+            values[chosen, 0] = headings[len(begin) :]
     return replace(references, values=values)
+
+
+_POSES_AT_ONCE = 200_000  # whose odometry is in memory when headings are unwrapped: 40 MB; chosen
+
+
+def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """Continuous headings (rad), as given where they are, and the indices of trajectories in which they are ambiguous.
+
+    Every increment gets the whole turns that bring it closest to the design model's odometry. Where the reference is
+    dense this is the nearest turn; where it is sparse, the odometry tells how often the robot turned in between. A
+    trajectory is ambiguous if the two still differ by more than a quarter turn between two reference poses.
+    """
+    model = OdometryModel.of_design(robot, "arc")
+    blocks = (np.cumsum([len(heading) for heading in headings]) // _POSES_AT_ONCE).tolist()
+    parts = groupby(zip(blocks, logs, strict=True), key=itemgetter(0))
+    odometries = (odometry for _, part in parts for odometry in model.poses([log for _, log in part]))
+    unwrapped, ambiguous = list[Array](), list[int]()
+    for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
+        driven = odometry[:, 2]
+        continuous = nearest_turns(heading, driven)
+        unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
+        if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
+            ambiguous.append(index)
+    return unwrapped, ambiguous
 
 
 def nearest_turns(headings: Array, driven: Array) -> Array:

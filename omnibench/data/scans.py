@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -24,8 +23,8 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, model_validator
 
 from omnibench.config import Model, NonNegative, Positive
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, readable, sink_frames
-from omnibench.data.stored import Rows, Table, check_columns, times_flaw
+from omnibench.data.parquet import OpenedTable, parquet_shape, readable, sink_frames
+from omnibench.data.stored import Rows, Table, check_columns, refuse, times_flaw
 from omnibench.errors import DataError
 from omnibench.files import TableFormat, check_file, unquoted_formulas
 from omnibench.robot.kinematics import Array
@@ -95,11 +94,10 @@ class Scanner(Model):
     @property
     def bearings(self) -> Array:
         """Directions of the rays (R,) over the floor, in the robot's frame, rad."""
-        pitch = self.mount.pitch
-        if not pitch:
-            return self.angles + self.mount.yaw
-        over_the_floor: Array = np.arctan2(np.sin(self.angles), np.cos(self.angles) * math.cos(pitch))  # Eq. (1)
-        return over_the_floor + self.mount.yaw
+        angles, pitch = self.angles, self.mount.pitch
+        if pitch:
+            angles = np.arctan2(np.sin(angles), np.cos(angles) * math.cos(pitch))  # Eq. (1)
+        return angles + self.mount.yaw
 
     @property
     def level_shares(self) -> Array:
@@ -112,8 +110,7 @@ class Scanner(Model):
         """Ranges (R,) at which the rays meet the floor, m; inf for those that do not."""
         down = np.cos(self.angles) * math.sin(self.mount.pitch)  # Eq. (1)
         falling = down > 0
-        ranges: Array = np.where(falling, self.mount.height / np.where(falling, down, 1.0), np.inf)
-        return ranges
+        return np.where(falling, self.mount.height / np.where(falling, down, 1.0), np.inf)
 
     @property
     def delays(self) -> Array:
@@ -185,16 +182,15 @@ class ScansOnDisk(Scans):
     """
 
     def __init__(self, file: Path, scanner: Scanner, trajectories: Iterable[str]) -> None:
-        self.file, self._state, self._in_parquet = file, file_state(file), file.suffix == ".parquet"
-        self._place = f"{file}: "
-        if self._in_parquet:
+        self.file, self._place, self._table = file, f"{file}: ", OpenedTable.of(file)
+        if in_parquet := file.suffix == ".parquet":
             parquet_shape(file)
         else:
             check_file(file, text=True)
         with readable(file):
-            check_columns(file, list(self._lazy().collect_schema()), _COLUMNS)
-            frame = self._lazy().select("trajectory", "t").collect()
-        table = Table(file, frame if self._in_parquet else unquoted_formulas(frame))
+            check_columns(file, list(self._table.lazy().collect_schema()), _COLUMNS)
+        frame = self._table.rows(["trajectory", "t"])
+        table = Table(file, frame if in_parquet else unquoted_formulas(frame))
         times, ids = table.numbers("t"), list(trajectories)
         recorded: dict[str, tuple[Array, Callable[[], Ranges]]] = {}
         for index, rows in table.rows_by_run(ids, "the table of trajectories"):
@@ -204,19 +200,29 @@ class ScansOnDisk(Scans):
             recorded[ids[index]] = of_run, partial(self._ranges, rows, ids[index], of_run)
         super().__init__(scanner, recorded)
 
-    def _lazy(self) -> pl.LazyFrame:
-        if self._in_parquet:
-            return pl.scan_parquet(self.file, glob=False)
-        # Cells are read as text, so that one that is no number is reported with its row.
-        return pl.scan_csv(self.file, infer_schema=False, glob=False)
-
     def _ranges(self, rows: Rows, trajectory: str, times: Array) -> Ranges:
         """The ranges (S, R) of a trajectory's rows, which are read in parts. DataError names the row of a flaw."""
-        check_unchanged(self.file, self._state)
-        ranges = np.empty((len(rows), self.scanner.rays), np.float32)
-        parts = np.flatnonzero(np.diff(rows // (_MOST_ROWS if self._in_parquet else _ROWS_OF_CSV))) + 1
-        for part in np.split(np.arange(len(rows)), parts):
-            ranges[part] = self._read(rows[part])
+        rays = self.scanner.rays
+        ranges = np.empty((len(rows), rays), np.float32)
+        most = _MOST_ROWS if self.file.suffix == ".parquet" else _ROWS_OF_CSV
+        edges = np.flatnonzero(np.diff(rows // most)) + 1
+        for part in np.split(np.arange(len(rows)), edges):
+            wrong, first, last = partial(refuse, self.file, rows[part]), int(rows[part[0]]), int(rows[part[-1]])
+            column = self._table.rows(["ranges"], first, last - first + 1)["ranges"][rows[part] - first]
+            if isinstance(column.dtype, pl.Array):
+                column = column.arr.to_list()
+            if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
+                texts = column.str.strip_chars().str.split(" ")
+                column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
+                broken = texts.list.len() != column.list.drop_nulls().list.len()
+                wrong(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
+            if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
+                raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
+            lengths = column.list.len().fill_null(0)
+            wrong(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
+            ranges[part] = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(-1, rays)
+            unknown = np.isnan(ranges[part]).any(axis=1)
+            wrong(unknown, "a range is missing or NaN; write inf where nothing was seen")
         empty = ~self.scanner.valid(ranges).any(axis=1)
         for row in np.flatnonzero(empty)[:1].tolist():
             seen = ranges[row][np.isfinite(ranges[row])]
@@ -224,33 +230,7 @@ class ScansOnDisk(Scans):
             limits = f"from {self.scanner.range_min:g} to {self.scanner.range_max:g} m"
             way = "they look like mm, give m" if in_millimetres else "remove the row"
             what = f"the scan of trajectory {trajectory} at {times[row]:g} s is empty: no range {limits}; {way}"
-            raise DataError(f"{self.file}, row {rows[row] + 1}: {what}")
-        return ranges
-
-    def _read(self, rows: Rows) -> Ranges:
-        """The ranges (n, R) of some rows; DataError: they are not as many numbers as the scanner has rays."""
-
-        def refuse(faulty: Any, what: str, values: Any = ()) -> None:
-            for index in np.flatnonzero(faulty)[:1].tolist():
-                shown = what.format(values[index]) if len(values) else what
-                raise DataError(f"{self.file}, row {rows[index] + 1}: {shown}")
-
-        first, last, rays = int(rows[0]), int(rows[-1]), self.scanner.rays
-        with readable(self.file):
-            column = self._lazy().select("ranges").slice(first, last - first + 1).collect()["ranges"][rows - first]
-        if isinstance(column.dtype, pl.Array):
-            column = column.arr.to_list()
-        if column.dtype == pl.String:  # in CSV a cell is text with blanks between the numbers
-            texts = column.str.strip_chars().str.split(" ")
-            column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
-            broken = texts.list.len() != column.list.drop_nulls().list.len()
-            refuse(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
-        if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
-            raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
-        lengths = column.list.len().fill_null(0).to_numpy()
-        refuse(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
-        ranges: Ranges = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(len(rows), -1)
-        refuse(np.isnan(ranges).any(axis=1), "a range is missing or NaN; write inf where nothing was seen")
+            refuse(self.file, rows, empty, what)
         return ranges
 
 
@@ -259,22 +239,18 @@ def write_scans(scans: Scans, table_format: TableFormat, trajectories: Iterable[
 
     Ranges are written in single precision. DataError: scans cannot be read. OSError: the disk refuses.
     """
-    recorded = set(scans.trajectories)
-    chosen = [trajectory for trajectory in trajectories if trajectory in recorded]
     as_text = table_format == "csv"
 
-    ranges = pl.String() if as_text else pl.List(pl.Float32)
-    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": ranges}
-    frames = (frame for trajectory in chosen for frame in _frames(trajectory, scans.of(trajectory), as_text))
-    sink_frames(frames, types, table_format, _ROW_GROUP, file)
+    def frames() -> Iterator[pl.DataFrame]:
+        for trajectory in filter(set(scans.trajectories).__contains__, trajectories):
+            of_run = scans.of(trajectory)
+            for first in range(0, len(of_run.times), _ROW_GROUP):
+                part = slice(first, first + _ROW_GROUP)
+                ranges = pl.Series(np.asarray(of_run.ranges[part], dtype=np.float32)).arr.to_list()
+                if as_text:
+                    ranges = ranges.cast(pl.List(pl.String)).list.join(" ")
+                yield pl.DataFrame({"trajectory": trajectory, "t": of_run.times[part], "ranges": ranges}, schema=types)
+            del of_run  # before the next one's are read
 
-
-def _frames(trajectory: str, scans: TrajectoryScans, as_text: bool) -> Iterator[pl.DataFrame]:
-    for first in range(0, len(scans.times), _ROW_GROUP):
-        part = slice(first, first + _ROW_GROUP)
-        times, ranges = scans.times[part], np.asarray(scans.ranges[part], dtype=np.float32)
-        columns = {"trajectory": [trajectory] * len(times), "t": times, "ranges": ranges}
-        frame = pl.DataFrame(columns).with_columns(pl.col("ranges").arr.to_list(), pl.col("t").cast(pl.Float64))
-        if as_text:
-            frame = frame.with_columns(pl.col("ranges").cast(pl.List(pl.String)).list.join(" "))
-        yield frame
+    types = {"trajectory": pl.String(), "t": pl.Float64(), "ranges": pl.String() if as_text else pl.List(pl.Float32)}
+    sink_frames(frames(), types, table_format, _ROW_GROUP, file)

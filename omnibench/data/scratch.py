@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import pickle
 import weakref
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, Generic, TypeVar, overload
+from typing import Any
 
 import numpy as np
 
 from omnibench.errors import DataError
-
-T = TypeVar("T")
 
 
 def temporary_file(ending: str) -> Any:
@@ -27,67 +25,52 @@ def temporary_file(ending: str) -> Any:
     return file
 
 
-class Scratch:
-    """A temporary file that objects are appended to."""
+class Scratch(Sequence[Any]):
+    """A temporary file that objects are appended to, each of which is read whenever it is asked for.
 
-    def __init__(self) -> None:
-        self._file = temporary_file(".scratch")
+    path: of the file in another process, which only reads it.
+    """
 
-    def stored(self, value: T) -> Stored[T]:
-        """The value, which from now on lies in the file. DataError: the disk refuses."""
-        path, offset = Path(self._file.name), self._file.tell()
+    def __init__(self, path: Path | None = None) -> None:
+        if path is None:
+            self._file = temporary_file(".scratch")
+        self._path, self._offsets = path or Path(self._file.name), list[int]()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Scratch, (self._path,)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._read(self._offsets[index])
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    def stored(self, value: Any) -> Callable[[], Any]:
+        """A function that reads the value, which from now on lies in the file. DataError: the disk refuses."""
+        self._offsets.append(self._file.tell())
         try:
             pickle.dump(value, self._file, protocol=pickle.HIGHEST_PROTOCOL)
             self._file.flush()
         except OSError as error:
             way = "set TMPDIR to a folder with more space"
-            raise DataError(f"{path}: cannot be written: {error.strerror or error}; {way}") from None
-        return Stored(path, offset, self)
+            raise DataError(f"{self._path}: cannot be written: {error.strerror or error}; {way}") from None
+        return partial(self._read, self._offsets[-1])
 
-    def sequence(self, values: Iterable[T]) -> StoredSequence[T]:
-        """The values, of which one is in memory at a time."""
-        return StoredSequence(tuple(self.stored(value) for value in values))
-
-
-@dataclass(frozen=True)
-class Stored(Generic[T]):
-    """An object in a temporary file, which a call reads. scratch: keeps the file, in the process that made it."""
-
-    path: Path
-    offset: int
-    scratch: Scratch | None = field(default=None, repr=False, compare=False)
-
-    def __call__(self) -> T:
-        """The object. DataError: the file is gone."""
+    def _read(self, offset: int) -> Any:
+        """The object at an offset. DataError: the file is gone."""
         try:
-            with self.path.open("rb") as file:
-                file.seek(self.offset)
-                value: T = pickle.load(file)
+            with self._path.open("rb") as file:
+                file.seek(offset)
+                value = pickle.load(file)
         except OSError as error:
             way = "the process that imports it has ended: save the data set, and load that"
-            raise DataError(f"{self.path}: cannot be read: {error.strerror or error}; {way}") from None
+            raise DataError(f"{self._path}: cannot be read: {error.strerror or error}; {way}") from None
         if isinstance(value, np.ndarray):  # with NumPy's own object for its type, so that asarray passes it on
             return value.view(np.dtype(value.dtype.str))
         return value
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Stored, (self.path, self.offset)
-
-
-@dataclass(frozen=True)
-class StoredSequence(Sequence[T]):
-    """Objects in a temporary file, each of which is read whenever it is asked for."""
-
-    items: tuple[Stored[T], ...]
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[T]: ...
-
-    def __getitem__(self, index: int | slice) -> T | Sequence[T]:
-        return StoredSequence(self.items[index]) if isinstance(index, slice) else self.items[index]()
-
-    def __len__(self) -> int:
-        return len(self.items)
+    def sequence(self, values: Iterable[Any]) -> Scratch:
+        """The values, of which one is in memory at a time."""
+        for value in values:
+            self.stored(value)
+        return self

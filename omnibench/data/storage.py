@@ -5,53 +5,27 @@ from __future__ import annotations
 import glob
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import polars as pl
 from pydantic import Field, model_validator
 
 from omnibench.config import Model, Name, Positive, read_yaml, to_yaml, validate
-from omnibench.data.dataset import (
-    RUN_NUMBERS,
-    Dataset,
-    Imported,
-    Trajectory,
-    check_runs,
-    checked,
-    runs_of_tables,
-)
+from omnibench.data import stored
+from omnibench.data.dataset import RUN_NUMBERS, Dataset, Imported, Trajectory, check_runs, checked, runs_of_tables
 from omnibench.data.parquet import parquet_shape, sink_frames
 from omnibench.data.references import AT_ONE_TIME, References
 from omnibench.data.scans import Scanner, ScansOnDisk, write_scans
 from omnibench.data.splits import put_together
-from omnibench.data.stored import (
-    COVARIANCES,
-    MOST_IN_MEMORY,
-    POSES,
-    SENT,
-    Table,
-    pose_times_flaw,
-    read_samples,
-    read_table,
-    table_file,
-    wheel_columns,
-)
+from omnibench.data.stored import Table, read_table, table_file
 from omnibench.errors import ConfigError, DataError, require_type, shown
-from omnibench.files import (
-    FileContent,
-    TableFormat,
-    check_place,
-    encode_table,
-    remove,
-    resolved,
-    results_locked,
-    write_files,
-)
+from omnibench.files import FileContent, TableFormat, check_place, remove, resolved, results_locked, write_files
 from omnibench.progress import expect_reading
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural, some
@@ -78,11 +52,9 @@ class Header(Model):
 
     @model_validator(mode="after")
     def _wheels_are_the_robots(self) -> Header:
-        if self.wheels != self.robot.wheel_names:
-            raise ValueError(
-                f"wheels are {', '.join(self.wheels)}, but the robot's wheels with a measured rate are "
-                f"{', '.join(self.robot.wheel_names)}; name the same wheels in the same order"
-            )
+        if self.wheels != (names := self.robot.wheel_names):
+            measured = f"the robot's wheels with a measured rate are {', '.join(names)}"
+            raise ValueError(f"wheels are {', '.join(self.wheels)}, but {measured}; name these, in this order")
         return self
 
 
@@ -120,15 +92,13 @@ def read_recorded(folder: Path, *, left_in_files: bool = False) -> Dataset:
         # Without references there must be poses.
         if table_file(folder, name) is not None or (name == "poses" and not tables):
             tables[name] = read_table(folder, name)
-    samples = read_samples(folder, runs, header.robot, left_in_files=left_in_files)
-    trajectories = runs_of_tables(runs, samples, *(tables.get(name) for name in ("poses", "references", "commands")))
+    samples = stored.read_samples(folder, runs, header.robot, left_in_files=left_in_files)
+    trajectories = runs_of_tables(runs, samples, tables)
     scans = None
     if (file := table_file(folder, "scans")) is not None:
         if header.scanner is None:
-            raise DataError(
-                f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: rays, angle_min, "
-                "angle_increment, range_max (rad, m)"
-            )
+            keys = "rays, angle_min, angle_increment, range_max (rad, m)"
+            raise DataError(f"{folder / 'dataset.yaml'}: scanner is missing, which {file.name} needs: {keys}")
         scans = ScansOnDisk(file, header.scanner, runs.ids)
     described = {name: getattr(header, name) for name in _DESCRIBED}
     return Dataset(trajectories=tuple(trajectories), scans=scans, **described)
@@ -175,7 +145,7 @@ def _matching(pattern: str) -> list[Path]:
     return [folder for folder in folders if (folder / "dataset.yaml").is_file()]
 
 
-def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int = MOST_IN_MEMORY) -> Dataset:
+def load_dataset(path: Path | str | Sequence[Path | str], *, most_in_memory: int = stored.MOST_IN_MEMORY) -> Dataset:
     """Read and check a data set: a folder, or several of one robot, named one by one or by a glob.
 
     most_in_memory: wheel samples up to which they are held; those of Parquet files with more stay there, and are read
@@ -219,12 +189,9 @@ def save_dataset(
     require_type(dataset, Dataset, "load_dataset")
     folder, runs = Path(path), dataset.trajectories
     if not dataset.referenced:
-        raise DataError(
-            f"data set {dataset.name}: it has no reference poses; make them from its scans with slam_dataset, as "
-            "omnibench.import_dataset does"
-        )
+        raise DataError(f"data set {dataset.name}: it has no reference poses; omnibench.import_dataset makes some")
     for run in runs:
-        if run.references is None and (flaw := pose_times_flaw(run.pose_times, run.id, fewest=2)) is not None:
+        if run.references is None and (flaw := stored.pose_times_flaw(run.pose_times, run.id, fewest=2)) is not None:
             raise DataError(f"data set {dataset.name}: {flaw[1]}; leave it out")
     check_dataset_folder(folder)
     if not overwrite and (folder / "dataset.yaml").is_file():
@@ -239,12 +206,8 @@ def save_dataset(
     header = Header(wheels=dataset.robot.wheel_names, scanner=None if scans is None else scans.scanner, **described)
     text = to_yaml(header.model_dump(mode="json", by_alias=True, exclude=None if header.imported else {"imported"}))
     contents: dict[Path, FileContent] = {folder / "dataset.yaml": text.encode()}
-    for name, table in _tables(dataset, whole=True).items():
-        file = folder / f"{name}.{table_format}"
-        if isinstance(table, pl.DataFrame):
-            contents[file] = encode_table(table, table_format)
-        else:
-            contents[file] = partial(sink_frames, table.frames(), table.types, table_format, _ROW_GROUP)
+    for name, (types, parts) in _tables(dataset, whole=True).items():
+        contents[folder / f"{name}.{table_format}"] = partial(sink_frames, parts, types, table_format, _ROW_GROUP)
     if scans is not None:
         contents[folder / f"scans.{table_format}"] = partial(write_scans, scans, table_format, ids)
     with results_locked(folder):
@@ -264,64 +227,62 @@ def check_dataset_folder(folder: Path) -> None:
     check_place(folder)
 
 
-@dataclass(frozen=True)
-class _SampleTable:
-    """A table with rows of every run. columns: of the arrays of a run, by their names in Trajectory."""
+class _Frames(NamedTuple):
+    """A table in parts, with the types of its columns by name."""
 
-    runs: Sequence[Trajectory]
-    times: str
-    columns: Mapping[str, list[str]]
+    types: Mapping[str, Any]
+    parts: Iterable[pl.DataFrame]
 
-    @property
-    def types(self) -> dict[str, pl.DataType]:
-        """The types of the columns, by name."""
-        numbers = ["t", *(column for group in self.columns.values() for column in group)]
-        return {"trajectory": pl.String()} | dict.fromkeys(numbers, pl.Float64())
 
-    def frames(self) -> Iterator[pl.DataFrame]:
-        """The rows of each run; null where it does not have an array."""
-        for run in self.runs:
-            times = getattr(run, self.times)
-            columns: dict[str, Any] = {"trajectory": pl.repeat(run.id, len(times), eager=True), "t": times}
-            for name, group in self.columns.items():
+def _rows_of_runs(runs: Sequence[Trajectory], times: str, groups: Mapping[str, list[str]]) -> _Frames:
+    """A table with rows of every run; null where it does not have an array.
+
+    times, groups: the array of the times, and the columns of the others, by their names in Trajectory.
+    """
+    types = {"trajectory": pl.String()} | dict.fromkeys(["t", *chain(*groups.values())], pl.Float64())
+
+    def parts() -> Iterator[pl.DataFrame]:
+        for run in runs:
+            stamps = getattr(run, times)
+            columns: dict[str, Any] = {"trajectory": pl.repeat(run.id, len(stamps), eager=True), "t": stamps}
+            for name, group in groups.items():
                 values = getattr(run, name)
                 if name == "pose_covariances" and values is not None:
                     values = values[:, *np.triu_indices(3)]
                 columns |= {column: None if values is None else values[:, i] for i, column in enumerate(group)}
-            yield pl.DataFrame(columns, schema=self.types)
+            yield pl.DataFrame(columns, schema=types)
+
+    return _Frames(types, parts())
 
 
-def _tables(dataset: Dataset, *, whole: bool) -> dict[str, pl.DataFrame | _SampleTable]:
+def _tables(dataset: Dataset, *, whole: bool) -> dict[str, _Frames]:
     """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some.
 
     whole: without the columns of samples and poses that only some runs have, as files have no gaps.
     """
     runs, names = dataset.trajectories, ("command", "repetition", "split", "session", *RUN_NUMBERS)
     rows = [{"trajectory": run.id} | {name: getattr(run, name) for name in names} for run in runs]
+    frames = {"trajectories": _without_empty(pl.DataFrame(rows, infer_schema_length=None))}
+    if measured := [(run.id, run.references) for run in runs if run.references is not None]:
+        frames["references"] = reference_frame(measured)
+    if sent := [(run.id, *row) for run in runs if run.sent is not None for row in run.sent.tolist()]:
+        frames["commands"] = pl.DataFrame(sent, schema=["trajectory", *stored.SENT["sent"]], orient="row")
     present = all if whole else any
     groups = {
         name: columns
-        for name, columns in wheel_columns(dataset.robot).items()
+        for name, columns in stored.wheel_columns(dataset.robot).items()
         if present(run.samples.has(name) for run in runs)
     }
-    tables: dict[str, pl.DataFrame | _SampleTable] = {
-        "trajectories": _without_empty(pl.DataFrame(rows, infer_schema_length=None)),
-        "wheels": _SampleTable(runs, "times", groups),
-    }
+    tables = {"wheels": _rows_of_runs(runs, "times", groups)}
     if placed := [run for run in runs if run.start_known]:
         covered = present(run.pose_covariances is not None for run in placed)
-        tables["poses"] = _SampleTable(placed, "pose_times", POSES | (COVARIANCES if covered else {}))
-    if measured := [(run.id, run.references) for run in runs if run.references is not None]:
-        tables["references"] = reference_frame(measured)
-    if sent := [(run.id, *row) for run in runs if run.sent is not None for row in run.sent.tolist()]:
-        tables["commands"] = pl.DataFrame(sent, schema=["trajectory", *SENT["sent"]], orient="row")
-    return tables
+        tables["poses"] = _rows_of_runs(placed, "pose_times", stored.POSES | (stored.COVARIANCES if covered else {}))
+    return {name: _Frames(frame.schema, [frame]) for name, frame in frames.items()} | tables
 
 
 def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
     """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some."""
-    tables = _tables(dataset, whole=False).items()
-    return {name: table if isinstance(table, pl.DataFrame) else pl.concat(table.frames()) for name, table in tables}
+    return {name: pl.concat(table.parts) for name, table in _tables(dataset, whole=False).items()}
 
 
 def _without_empty(frame: pl.DataFrame) -> pl.DataFrame:

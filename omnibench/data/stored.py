@@ -1,21 +1,18 @@
 """Tables of a data set, whose every flaw is refused with its file and row, and the wheel samples of its runs.
 
-Of a data set larger than memory the samples stay in their Parquet file, and are read in blocks of whole runs whenever
-an array of a run is asked for. The last few blocks stay in memory, so that code which takes one run after another reads
+Of a data set larger than memory the samples stay in their Parquet file, and are read in blocks of rows whenever an
+array of a run is asked for. The last few blocks stay in memory, so that code which takes one run after another reads
 every block once.
 """
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
@@ -23,7 +20,7 @@ from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
 from omnibench.data.delimited import missing_column, not_increasing
-from omnibench.data.parquet import check_unchanged, file_state, parquet_shape, read_parquet, readable
+from omnibench.data.parquet import OpenedTable, parquet_shape, readable, scan_table
 from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
 from omnibench.progress import tell_reading
@@ -32,13 +29,14 @@ from omnibench.robot.odometry import Samples
 
 Rows = NDArray[np.intp]  # indices of rows of a table
 Flaw = tuple[int, str]  # row (0 is the first) of an array, and what is wrong there
+TimesFlaw = Callable[[Array, str], Flaw | None]  # the flaw in the times (n,) of a run, and its id
 
 LARGEST = 1e9  # a larger number is no measurement in SI units
 
 MOST_IN_MEMORY = 5_000_000  # wheel samples that are held: 200 MB of three wheels' (chosen)
 MOST_DRAWN = 3_000_000  # wheel samples by which a recording is judged: 500 runs of a minute at 100 Hz (chosen)
 _ROWS = 1_000_000  # rows that are checked at a time, of which the names take 16 MB (chosen)
-_BLOCK_ROWS = 500_000  # rows of a block, of whole runs: 16 MB of four columns (chosen)
+_BLOCK_ROWS = 500_000  # rows of a block: 16 MB of four columns (chosen)
 _BLOCKS_HELD = 3  # blocks in memory, those of all files together, beside one that is being read (chosen)
 _POSE = 4  # samples as which a reference pose counts when runs are drawn, by the memory that a fit takes (chosen)
 _FEWEST = 20  # runs that are drawn at least (chosen)
@@ -99,17 +97,26 @@ def values_flaw(values: Array, holds: str = "it holds", way: str = "check the un
     return row, f"{holds} {rows[row][np.abs(rows[row]).argmax()]:g}, which no robot can reach; {way}"
 
 
+def refuse(
+    file: Path, rows: Sequence[int] | Rows, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()
+) -> None:
+    """DataError for the first of some rows of a file, from 0, that is ``faulty`` (n,).
+
+    what: with ``{}`` for the row's one of the values (n,).
+    """
+    for index in np.flatnonzero(faulty)[:1].tolist():
+        raise DataError(f"{file}, row {rows[index] + 1}: {what.format(values[index]) if len(values) else what}")
+
+
 class Table:
     """A table with a column of the trajectories' names. Rows of messages count from 1, the first after the header.
 
-    file: where it is from; of a table in memory its name in messages. rows_before: rows of the file before those of the
-    frame. DataError: no rows, a required column or a trajectory's name is missing, a name is none.
+    file: where it is from; of a table in memory its name in messages. first: row of the file, from 0, that the frame
+    begins with. DataError: no rows, a required column or a trajectory's name is missing, a name is none.
     """
 
-    def __init__(
-        self, file: Path, frame: pl.DataFrame, required: Sequence[str] = ("trajectory",), rows_before: int = 0
-    ) -> None:
-        self.file, self.frame, self.rows_before = file, frame, rows_before
+    def __init__(self, file: Path, frame: pl.DataFrame, required: Sequence[str] = ("trajectory",), first: int = 0):
+        self.file, self.frame, self.first = file, frame, first
         check_columns(file, frame.columns, required)
         if frame.is_empty():
             raise DataError(f"{file}: it has no rows")
@@ -130,12 +137,11 @@ class Table:
 
     def fail(self, row: int, what: str) -> DataError:
         """The error to raise for ``row``, counted from 0."""
-        return DataError(f"{self.file}, row {self.rows_before + row + 1}: {what}")
+        return DataError(f"{self.file}, row {self.first + row + 1}: {what}")
 
     def refuse(self, faulty: NDArray[np.bool_] | pl.Series, what: str, values: Sequence[Any] | pl.Series = ()) -> None:
-        """DataError for the first row that is ``faulty`` (rows,). what: with ``{}`` for the row's one of the values."""
-        for row in np.flatnonzero(faulty)[:1].tolist():
-            raise self.fail(row, what.format(values[row]) if len(values) else what)
+        """DataError for the first row that is ``faulty`` (rows,), as ``refuse`` says it."""
+        refuse(self.file, range(self.first, self.first + len(self.frame)), faulty, what, values)
 
     def floats(self, column: str) -> pl.Series:
         """A column as floats, null where a cell is empty. DataError for text and other things."""
@@ -198,7 +204,7 @@ def present_groups(file: Path, groups: Mapping[str, list[str]], columns: Collect
 
 
 def arrays_by_run(
-    pieces: Iterable[Table], runs: Table, groups: Mapping[str, list[str]], flaw: Callable[[Array, str], Flaw | None]
+    pieces: Iterable[Table], runs: Table, groups: Mapping[str, list[str]], flaw: TimesFlaw
 ) -> Iterator[tuple[int, Rows, dict[str, Array]]]:
     """Arrays of the runs in the pieces of a table one after another: index of the run, its rows, its arrays by name.
 
@@ -213,15 +219,11 @@ def arrays_by_run(
             if (wrong := flaw(np.append(before, times), ids[index])) is not None:
                 raise table.fail(int(rows[wrong[0] - len(before)]), wrong[1])
             ends[index] = times[-1:]
-            yield index, table.rows_before + rows, {name: array[rows] for name, array in values.items()}
+            yield index, table.first + rows, {name: array[rows] for name, array in values.items()}
 
 
 def arrays_of_runs(
-    table: Table | None,
-    runs: Table,
-    groups: Mapping[str, list[str]],
-    flaw: Callable[[Array, str], Flaw | None],
-    without: Collection[str] = (),
+    table: Table | None, runs: Table, groups: Mapping[str, list[str]], flaw: TimesFlaw, without: Collection[str] = ()
 ) -> list[dict[str, Array]]:
     """The arrays of each run in a table, if there is one. without: ids of runs that may have no rows in it."""
     arrays = {index: of_run for index, _, of_run in arrays_by_run([table] if table else [], runs, groups, flaw)}
@@ -255,7 +257,8 @@ def read_table(folder: Path, name: str, required: Sequence[str] = ()) -> Table:
     if file is None:
         raise DataError(f"{folder}: {name}.parquet (or {name}.csv) is missing")
     if file.suffix == ".parquet":
-        return Table(file, read_parquet(file), required)
+        with readable(file):
+            return Table(file, scan_table(file)[1].collect(), required)
     check_file(file, MOST_TEXT, text=True)
     with readable(file):
         frame = pl.read_csv(file, infer_schema_length=None, schema_overrides=_TEXTS, glob=False)
@@ -288,10 +291,8 @@ def _present_columns(file: Path, columns: Sequence[str], robot: Robot) -> dict[s
     for wheel in robot.drive.steered:
         if (column := f"steer_{wheel}") not in columns:
             hint = nearest(column, [name for name in columns if not name.startswith("omega_")])
-            raise DataError(
-                f"{file}: column {column!r}, the steering angle of wheel {wheel} (rad, counter-clockwise, at "
-                f"the sample's end), is missing; {hint}found: {', '.join(columns)}"
-            )
+            what = f"the steering angle of wheel {wheel} (rad, counter-clockwise, at the sample's end), is missing"
+            raise DataError(f"{file}: column {column!r}, {what}; {hint}found: {', '.join(columns)}")
     return present_groups(file, wheel_columns(robot), columns)
 
 
@@ -315,90 +316,62 @@ def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | N
     None: the rows of a run do not stand together, or numbers are texts, so that the table must be read whole. DataError
     as for ``samples_in_memory``.
     """
-    state, types = file_state(file), parquet_shape(file)[1]
+    # Workers, and jobs that change their folder, find an absolute path, too.
+    table, (length, types) = OpenedTable.of(file.absolute()), parquet_shape(file)
     columns = _present_columns(file, list(types), robot)
-    names = ["t", *(name for group in columns.values() for name in group)]
-    if not all(types[name].is_numeric() for name in names):
+    names = ["trajectory", "t", *(name for group in columns.values() for name in group)]
+    if not all(types[name].is_numeric() for name in names[1:]):
         return None
+    pieces = (Table(file, _rows(table, names, at, _ROWS), names, at) for at in range(0, max(length, 1), _ROWS))
     places: dict[int, tuple[int, int, float]] = {}  # first row, number of rows and end of each run
-    for index, rows, arrays in arrays_by_run(_pieces(file, ["trajectory", *names]), runs, columns, wheel_times_flaw):
+    for index, rows, arrays in arrays_by_run(pieces, runs, columns, wheel_times_flaw):
         first, count, _ = places.get(index, (int(rows[0]), 0, 0.0))
         if not np.array_equal(rows, np.arange(first + count, first + count + len(rows))):
             return None
         places[index] = first, count + len(rows), float(arrays["times"][-1])
     refuse_runs_without_rows(file, runs, places)
-    edges, last = [0], 0  # of blocks of whole runs
-    for end in sorted(first + count for first, count, _ in places.values()):
-        if end - edges[-1] > _BLOCK_ROWS and last > edges[-1]:
-            edges.append(last)
-        last = end
-    edges.append(last)
-    # Workers, and jobs that change their folder, find an absolute path, too.
-    blocks = [Block(file.absolute(), state, begin, end - begin) for begin, end in pairwise(edges)]
     columns = {"times": ["t"], **columns}
     of_odometry = [column for name in _OF_ODOMETRY for column in columns.get(name, ())]
     samples = []
     for index in range(len(places)):
-        first, count, of_last = places[index]
-        block, readers = blocks[bisect_right(edges, first) - 1], dict[str, Any]()
+        first, count, end = places[index]
+        readers: dict[str, Any] = {}
         for name, group in columns.items():
-            read = of_odometry if name in _OF_ODOMETRY else group
-            chosen = slice(begin := read.index(group[0]), begin + len(group))
-            readers[name] = partial(_read, block, tuple(read), chosen, first - block.first, count, name == "times")
-        samples.append(Samples(readers, (count, of_last)))
+            together = of_odometry if name in _OF_ODOMETRY else group
+            chosen = slice(begin := together.index(group[0]), begin + len(group))
+            readers[name] = partial(_read, table, tuple(together), chosen, first, count, name == "times")
+        samples.append(Samples(readers, (count, end)))
     return samples
 
 
-def _pieces(file: Path, columns: Sequence[str]) -> Iterator[Table]:
-    """A Parquet table in pieces."""
-    first, frame = 0, _rows(file, columns, 0, _ROWS)
-    while not first or len(frame):
-        tell_reading(len(frame), "sample")
-        yield Table(file, frame, columns, first)
-        first += len(frame)
-        frame = _rows(file, columns, first, _ROWS)
-
-
-def _rows(file: Path, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
-    with readable(file):
-        return pl.scan_parquet(file, glob=False).select(columns).slice(first, count).collect()
-
-
-class Block(NamedTuple):
-    """Some rows of a Parquet file, of whole runs. state: of the file when it was opened, see ``file_state``."""
-
-    file: Path
-    state: tuple[int, int]
-    first: int
-    size: int
+def _rows(table: OpenedTable, columns: Sequence[str], first: int, count: int) -> pl.DataFrame:
+    rows = table.rows(columns, first, count)
+    tell_reading(len(rows), "sample")
+    return rows
 
 
 @lru_cache(maxsize=_BLOCKS_HELD)
-def read_block(block: Block, columns: tuple[str, ...]) -> Array:
-    """Values (rows, n) of some columns of a block. DataError: the file has changed, or cannot be read."""
-    check_unchanged(block.file, block.state)
-    tell_reading(block.size, "sample")
-    return _rows(block.file, columns, block.first, block.size).cast(pl.Float64).to_numpy()
+def read_block(table: OpenedTable, columns: tuple[str, ...], number: int) -> Array:
+    """Values (rows, n) of some columns of a block of a Parquet file, by its number from 0 on. DataError."""
+    return _rows(table, columns, number * _BLOCK_ROWS, _BLOCK_ROWS).cast(pl.Float64).to_numpy()
 
 
-def _read(block: Block, columns: tuple[str, ...], chosen: slice, first: int, count: int, flat: bool) -> Array:
-    """Values (count, n) of the chosen ones of some columns, from a row of a block on; (count,) where ``flat``."""
-    values = read_block(block, columns)[first : first + count, chosen].copy("C")  # a view would keep the whole block
+def _read(table: OpenedTable, columns: tuple[str, ...], chosen: slice, first: int, count: int, flat: bool) -> Array:
+    """Values (count, n) of the chosen ones of some columns, from a row on; (count,) where ``flat``."""
+    parts = []
+    for number in range(first // _BLOCK_ROWS, (first + count - 1) // _BLOCK_ROWS + 1):
+        begin = first - number * _BLOCK_ROWS
+        parts.append(read_block(table, columns, number)[max(begin, 0) : begin + count, chosen])
+    # A copy, as a view would keep the whole block.
+    values = np.concatenate(parts, out=np.empty((count, chosen.stop - chosen.start)))
     values.flags.writeable = False  # a change would be lost
     return values[:, 0] if flat else values
-
-
-class Sampled(Protocol):
-    """A run, or a log."""
-
-    @property
-    def samples(self) -> Samples: ...
 
 
 Run = TypeVar("Run", bound=Any)  # a run, or a log
 
 
-def median_period(runs: Sequence[Sampled]) -> float:
+def median_period(runs: Sequence[Any]) -> float:
     """The median time between the wheel samples of runs, the start being the first, s.
 
     It is robust to jitter and gaps. Of very many samples it is the period of the run in the middle: the median of the
@@ -415,10 +388,7 @@ def median_period(runs: Sequence[Sampled]) -> float:
 
 def median_step(times: Iterable[Array]) -> float:
     """The median time between stamps that follow each other in one of several arrays, s."""
-    steps = array("d")  # without a list of arrays beside it: 10^7 steps take 80 MB
-    for stamps in times:
-        steps.frombytes(np.diff(stamps).tobytes())
-    return float(np.median(np.frombuffer(steps), overwrite_input=True))
+    return float(np.median(np.concatenate([np.diff(stamps) for stamps in times]), overwrite_input=True))
 
 
 def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
@@ -439,7 +409,7 @@ def drawn_runs(runs: Sequence[Run], most: int = MOST_DRAWN) -> list[Run]:
     return [in_memory(runs[index]) for index in sorted([*first, *others][:count])]
 
 
-def count_drawn(runs: Sequence[Sampled], most: int = MOST_DRAWN) -> int:
+def count_drawn(runs: Sequence[Any], most: int = MOST_DRAWN) -> int:
     """How many runs ``drawn_runs`` draws."""
     rows = sum(max(run.samples.count, _POSE * len(getattr(run, "pose_times", ()))) for run in runs)
     return min(max(_FEWEST, len(runs) * most // max(rows, 1)), len(runs))

@@ -28,7 +28,7 @@ from omnibench.simulate.config import FlowerConfig, RobotConfig, Truth
 from omnibench.simulate.robot_simulator import simulate_flower, simulate_robot
 from omnibench.simulate.truth import Simulation, reference_noise
 from omnibench.slam.import_dataset import import_dataset
-from omnibench.slam.slam_request import SlamAccuracy, slam_accuracy
+from omnibench.slam.slam_dataset import SlamAccuracy, slam_accuracy
 from omnibench.views import Brief
 
 _FLOWER, _ROBOT = CHOSEN + FlowerConfig.__name__, CHOSEN + RobotConfig.__name__

@@ -5,9 +5,9 @@ A motion (3,) is written as the constant twist that makes it in unit time, m, m,
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,14 +41,12 @@ class MotionWithinScan:
 
     def at(self, delays: Array) -> Array:
         """The motions (n, 3) until delays (n,), s, each as the twist that makes it in unit time."""
-        motions: Array = _powers(delays, len(self.coefficients)) @ self.coefficients
-        return motions
+        return _powers(delays, len(self.coefficients)) @ self.coefficients
 
     @property
     def mean(self) -> Array:
         """The mean twist (3,) over the scan."""
-        mean: Array = self.duration ** np.arange(len(self.coefficients)) @ self.coefficients
-        return mean
+        return self.duration ** np.arange(len(self.coefficients)) @ self.coefficients
 
 
 def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[MotionWithinScan], Array]:
@@ -62,8 +60,7 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     count = 2 + int((_AROUND + duration) / _INSTANT)
     delays = np.linspace(-_AROUND / 2, duration + _AROUND / 2, count)
     delays = np.maximum(times[:, None] + delays, 0.0) - times[:, None]  # (S, count)
-    stamps, place = np.unique(np.column_stack([times, times[:, None] + delays]), return_inverse=True)
-    poses = odometry(stamps)[place.reshape(len(times), -1)]
+    poses = odometry(np.column_stack([times, times[:, None] + delays]).ravel()).reshape(len(times), -1, 3)
     motions = unit_twist(relative(poses[:, 0][:, None], poses[:, 1:]))
     basis = np.concatenate([np.ones((*delays.shape, 1)), _powers(delays, _DEGREE)], axis=2)
     inverse = np.linalg.pinv(basis)
@@ -75,11 +72,8 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     parts = duration * np.linspace(0.2, 1.0, 5)
     means = parts[:, None] ** np.arange(_DEGREE) @ inverse[:, 1:]  # twists of parts of the scan: (S, 5, count)
     deviations = np.sqrt(_ALIKE * (means**2).sum(axis=2).mean(axis=1)[:, None] * squares)
-    motions_within = [
-        MotionWithinScan(coefficients[1:], duration, scan_deviations)
-        for coefficients, scan_deviations in zip(fitted, deviations, strict=True)
-    ]
-    return motions_within, np.sqrt(coarse)
+    scans = zip(fitted, deviations, strict=True)
+    return [MotionWithinScan(each[1:], duration, of_scan) for each, of_scan in scans], np.sqrt(coarse)
 
 
 def _powers(delays: Array, count: int) -> Array:
@@ -95,8 +89,7 @@ _UNSTEADY = 0.5  # 1/s: change of a twist in a second, as a share of the robot's
 _MATCH_NOISE: Array = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: standard deviations of a motion between matched poses
 
 
-@dataclass(frozen=True, eq=False)
-class MotionPrediction:
+class MotionPrediction(NamedTuple):
     """Prediction for a scan before it is matched.
 
     start (3,): predicted pose. deviations (3,): standard deviations of the motion since the last scan, in the robot's
@@ -108,55 +101,33 @@ class MotionPrediction:
     within: MotionWithinScan
 
 
-class MotionPrior(ABC):
-    """Prior of the motion of one run. times (S,): times of its scans, s; scan 0 is the first. duration: a scan's, s."""
+class OdometryPrior:
+    """Prior from odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse.
 
-    def __init__(self, times: Array, duration: float) -> None:
-        self._periods, self._duration = np.diff(times, prepend=times[0]), duration
-
-    @abstractmethod
-    def first(self) -> tuple[MotionWithinScan, Array]:
-        """The motion during the first scan, and standard deviations (3,) of its twist, m/s, m/s, rad/s."""
-
-    @abstractmethod
-    def predict(self, scan: int, last: Array) -> MotionPrediction:
-        """The prediction for a scan after the first. last (3,): pose of the scan before it."""
-
-    @abstractmethod
-    def correct(self, scan: int, last: Array, pose: Array, before: Array) -> tuple[Array, Array]:
-        """Correct the motion during a scan by the scan's roughly known ``pose`` (3,).
-
-        Returns the twist (3,) to add to the predicted one, and standard deviations (3,) of the corrected twist. last
-        (3,): pose of the scan before. before (3,): twist that had been added when the pose was estimated.
-        """
-
-    def _skew_error(self, scan: int, change: Array) -> Array:
-        """Standard deviations (3,) of the twist after a change (3,) by a pose that this change itself had skewed."""
-        return self._duration / (2 * self._periods[scan]) * np.abs(change)
-
-
-class OdometryPrior(MotionPrior):
-    """Prior from odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse."""
+    odometry: poses (K, 3) at times (K,), s, in any order. times (S,): of the scans, s. duration: of a scan, s.
+    """
 
     def __init__(self, odometry: Callable[[Array], Array], times: Array, duration: float, options: SlamOptions) -> None:
-        stamps, place = np.unique(times, return_inverse=True)
-        self._poses = odometry(stamps)[place]
+        self._poses, self._error = odometry(times), options.odometry_error
         self._within, self._coarse = smoothed(odometry, times, duration)
-        self._error = options.odometry_error
-        super().__init__(times, duration)
+        self._periods, self._duration = np.diff(times, prepend=times[0]), duration
 
     def first(self) -> tuple[MotionWithinScan, Array]:
+        """The motion during the first scan, and standard deviations (3,) of its twist, m/s, m/s, rad/s."""
         return self._within[0], self._deviations(0, self._within[0].mean)
 
     def predict(self, scan: int, last: Array) -> MotionPrediction:
+        """The prediction for a scan after the first. last (3,): pose of the scan before it."""
         driven = relative(self._poses[scan - 1], self._poses[scan])
         return MotionPrediction(compose(last, driven), odometry_deviations(driven, self._error), self._within[scan])
 
     def correct(self, scan: int, last: Array, pose: Array, before: Array) -> tuple[Array, Array]:
-        """Scale the odometry's error since the last scan to the motion within this scan.
+        """Correct the motion during a scan by its roughly known ``pose`` (3,).
 
-        The correction gets a smaller share the less the robot has moved, and the less the odometry's error exceeds that
-        of the matched pose.
+        Returns the twist (3,) to add to the predicted one, and standard deviations (3,) of the corrected twist. last
+        (3,): pose of the scan before. before (3,): twist that had been added when the pose was estimated. The error of
+        the odometry since the last scan is scaled to this scan: by a smaller share the less the robot has moved, and
+        the less the odometry's error exceeds that of the matched pose.
         """
         if not self._duration:
             return np.zeros(3), np.zeros(3)
@@ -168,7 +139,7 @@ class OdometryPrior(MotionPrior):
         errors = (
             self._deviations(scan, twist - share * driven),
             share * noise,
-            self._skew_error(scan, correction - before),
+            _skew_error(self._duration, self._periods[scan], correction - before),
         )
         return correction, np.sqrt(np.square(errors).sum(axis=0))
 
@@ -177,11 +148,14 @@ class OdometryPrior(MotionPrior):
         return np.hypot(odometry_deviations(uncorrected, self._error), self._within[scan].deviations)
 
 
-class LastPosePrior(MotionPrior):
-    """Prior from the last poses alone: the search starts from the last one. At the first scan the robot stands."""
+class LastPosePrior:
+    """Prior from the last poses alone: the search starts from the last one. At the first scan the robot stands.
+
+    Its methods are those of ``OdometryPrior``.
+    """
 
     def __init__(self, times: Array, duration: float, options: SlamOptions) -> None:
-        super().__init__(times, duration)
+        self._periods, self._duration = np.diff(times, prepend=times[0]), duration
         self._greatest = np.array([options.speed, options.speed, options.turn_rate])
         self._mean: Array = np.zeros(3)  # twist between the last two scans
         self._before: Array | None = None  # the pose of the first of them
@@ -202,8 +176,17 @@ class LastPosePrior(MotionPrior):
         mean = unit_twist(relative(last, pose)) / period
         change = (mean - self._mean) * (period + self._duration) / (period + self._periods[scan - 1]) / 2
         correction = mean + change - self._mean
-        errors = change, _UNSTEADY * self._greatest * self._duration / 2, self._skew_error(scan, correction - before)
+        skew = _skew_error(self._duration, period, correction - before)
+        errors = change, _UNSTEADY * self._greatest * self._duration / 2, skew
         return correction, np.sqrt(np.square(errors).sum(axis=0))
+
+
+MotionPrior = OdometryPrior | LastPosePrior
+
+
+def _skew_error(duration: float, period: float, change: Array) -> Array:
+    """Standard deviations (3,) of the twist after a change (3,) by a pose that this change itself had skewed."""
+    return duration / (2 * period) * np.abs(change)
 
 
 def odometry_deviations(driven: Array, error: float) -> Array:

@@ -10,7 +10,8 @@ One step is linear in the correspondences of the scan's points with surfaces of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
@@ -26,8 +27,7 @@ from omnibench.slam.slam_options import SlamOptions
 _TILT = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
+class Lines(NamedTuple):
     """Line segments.
 
     centres (m, 2): m. normals (m, 2): unit vectors towards the scanner. half_lengths (m,): m. rays (m,): number of rays
@@ -56,26 +56,19 @@ def fit_lines(
     ranges = np.hypot(points[:, 0], points[:, 1])
     directions = points / ranges[:, None]
     part_of = np.empty(len(points), dtype=np.int64)
-    cosines, sines = np.ascontiguousarray(directions.T)
-    grown = grow_lines(ranges, cosines, sines, np.ascontiguousarray(deviations), rays.astype(np.int64), part_of)
+    grown = grow_lines(np.column_stack([ranges, directions, deviations]), rays.astype(np.int64), part_of)
     line, first, last = grown[:, :2], grown[:, 5].astype(int), grown[:, 6].astype(int)
     squared = (line**2).sum(axis=1)
     tilts = (
         line[:, 1] ** 2 * grown[:, 2] - 2 * line[:, 0] * line[:, 1] * grown[:, 3] + line[:, 0] ** 2 * grown[:, 4]
     ) / squared**2
-    kept = np.flatnonzero(tilts < _TILT**2)
-    ends = [directions[at] / (line * directions[at]).sum(axis=1)[:, None] for at in (first, last)]
-    lines = Lines(
-        centres=((ends[0] + ends[1]) / 2)[kept],
-        normals=(-line / np.sqrt(squared)[:, None])[kept],
-        half_lengths=np.linalg.norm(ends[1] - ends[0], axis=1)[kept] / 2,
-        rays=np.bincount(part_of[part_of >= 0], minlength=len(line))[kept],
-        tilt_variances=tilts[kept],
-        delays=((delays[first] + delays[last]) / 2)[kept],
-    )
-    number = np.full(len(line) + 1, -1)  # the last one is for points that are part of no line
-    number[kept] = np.arange(len(kept))
-    return lines, number[part_of]
+    one, other = (directions[at] / (line * directions[at]).sum(axis=1)[:, None] for at in (first, last))
+    half_lengths, normals = np.linalg.norm(other - one, axis=1) / 2, -line / np.sqrt(squared)[:, None]
+    counts = np.bincount(part_of[part_of >= 0], minlength=len(line))
+    kept = tilts < _TILT**2
+    every = Lines((one + other) / 2, normals, half_lengths, counts, tilts, (delays[first] + delays[last]) / 2)
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)  # the last one is for points of no line
+    return Lines._make(values[kept] for values in every), number[part_of]
 
 
 # The study tests/studies/constants_slam.py varies these numbers by 0.5 and 2. In three rooms SLAM's median error
@@ -88,8 +81,7 @@ _FINEST = 1e-5  # m and rad: small_gicp's search ends with a step shorter than t
 _ITERATIONS = 20  # iterations of small_gicp, at most
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(NamedTuple):
     """Points of the map.
 
     centres (m, 2): m. normals (m, 2): unit vectors towards the scanner that saw them. line (m,): number of the line
@@ -106,10 +98,7 @@ class Surface:
 
     def at(self, index: NDArray[np.int_]) -> Surface:
         """Some of the points, in the order of ``index``."""
-        return Surface(*(getattr(self, name)[index] for name in _FIELDS))
-
-
-_FIELDS = tuple(field.name for field in fields(Surface))
+        return Surface._make(values[index] for values in self)
 
 
 class ScanMap:
@@ -119,11 +108,8 @@ class ScanMap:
     """
 
     def __init__(self, spacing: float) -> None:
-        self.spacing = spacing
-        self.surface = Surface(
-            np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0, int)
-        )
-        self._lines = 0
+        self.spacing, self._lines, none = spacing, 0, np.zeros(0, int)
+        self.surface = Surface(np.zeros((0, 2)), np.zeros((0, 2)), none, none, np.zeros(0), none)
 
     def __len__(self) -> int:
         return len(self.surface.centres)
@@ -157,17 +143,12 @@ class ScanMap:
         if new.sum() < _WORTH:
             return 0
         self._lines += len(lines.rays)
-        fresh = seen.at(np.flatnonzero(new))
-        self.surface = Surface(
-            *(np.concatenate([getattr(self.surface, name), getattr(fresh, name)]) for name in _FIELDS)
-        )
-        centres, normals = self.surface.centres, self.surface.normals
-        crosses = np.zeros((len(centres), 5, 3))
-        crosses[:, :, :2] = centres[:, None]
-        step = _CROSS * np.column_stack([-normals[:, 1], normals[:, 0]])
-        crosses[:, 1, :2] += step
-        crosses[:, 2, :2] -= step
-        crosses[:, 3, 2], crosses[:, 4, 2] = _CROSS, -_CROSS
+        fresh = zip(self.surface, seen.at(np.flatnonzero(new)), strict=True)
+        self.surface = Surface._make(np.concatenate(pair) for pair in fresh)
+        centres, normals = _upright(self.surface.centres), self.surface.normals
+        along_it, up = _CROSS * _upright(np.column_stack([-normals[:, 1], normals[:, 0]])), np.array([0, 0, _CROSS])
+        arms = [centres, centres + along_it, centres - along_it, centres + up, centres - up]
+        crosses = np.stack(arms, axis=1)
         self._cloud = small_gicp.PointCloud(crosses.reshape(-1, 3))
         self._tree = small_gicp.KdTree(self._cloud)
         small_gicp.estimate_normals(self._cloud, self._tree, 5)
@@ -175,8 +156,7 @@ class ScanMap:
 
     def merge_oldest(self) -> None:
         """Assign what keyframe 0 saw to keyframe 1, and count keyframes from there."""
-        keyframes = np.maximum(self.surface.keyframe - 1, 0)
-        self.surface = replace(self.surface, keyframe=keyframes)
+        self.surface = self.surface._replace(keyframe=np.maximum(self.surface.keyframe - 1, 0))
 
     def nearest(self, points: Array) -> tuple[NDArray[np.int_], Array]:
         """Index (n,) and distance (n,), m, of the map's point nearest to each of the points (n, 2)."""
@@ -214,8 +194,7 @@ def _upright(points: Array) -> Array:
     return np.column_stack([points, np.zeros(len(points))])
 
 
-@dataclass(frozen=True, eq=False)
-class ScanPoints:
+class ScanPoints(NamedTuple):
     """Points and lines of a deskewed scan, in the robot's frame at the scan's stamp.
 
     points (n, 2): m. rays (n, 2): unit vectors from the scanner to the points. delays (n,): since the scan's stamp, s.
@@ -232,13 +211,10 @@ class ScanPoints:
 
     def deskewed(self, twist: Array) -> ScanPoints:
         """The scan, deskewed by a further twist (3,) in the robot's frame, m/s, m/s, rad/s."""
-        motions, line_motions = self.delays[:, None] * twist, self.lines.delays[:, None] * twist
-        lines = replace(
-            self.lines,
-            centres=_moved(self.lines.centres, line_motions),
-            normals=rotated(self.lines.normals, line_motions[:, 2]),
-        )
-        return replace(self, points=_moved(self.points, motions), rays=rotated(self.rays, motions[:, 2]), lines=lines)
+        lines, motions, line_motions = self.lines, self.delays[:, None] * twist, self.lines.delays[:, None] * twist
+        centres, normals = _moved(lines.centres, line_motions), rotated(lines.normals, line_motions[:, 2])
+        lines = lines._replace(centres=centres, normals=normals)
+        return self._replace(points=_moved(self.points, motions), rays=rotated(self.rays, motions[:, 2]), lines=lines)
 
 
 def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: MotionWithinScan) -> ScanPoints:
@@ -256,7 +232,7 @@ def scan_points(ranges: Ranges, scanner: Scanner, noise_factor: float, within: M
     motions = within.at(delays)
     points = _moved(mount + distances[:, None] * directions, motions)
     lines, line = fit_lines(points - mount, deviations, delays, returned)
-    lines = replace(lines, centres=lines.centres + mount)
+    lines = lines._replace(centres=lines.centres + mount)
     return ScanPoints(points, rotated(directions, motions[:, 2]), delays, deviations, lines, line)
 
 
@@ -326,7 +302,7 @@ class Correspondences:
 
     def information(self) -> Array:
         """Fisher information (3, 3) of the points about the pose."""
-        return self._weighted(self._weights, self._slopes)
+        return _weighted(self._weights, self._slopes)
 
     def gradient(self) -> Array:
         """Gradient (3,) of the point-to-line cost 1/2 sum w d^2."""
@@ -336,8 +312,7 @@ class Correspondences:
         """Information (k,) along directions (3, k; columns) that errors of the map's normals cannot explain."""
         across, along = self._slopes @ directions, self._along @ directions
         explained = _FEIGNED**2 * self._surface.tilt_variances[:, None] * along**2
-        certain: Array = self._weights @ np.maximum(across**2 - explained, 0.0)
-        return certain
+        return self._weights @ np.maximum(across**2 - explained, 0.0)
 
     def rise(self, step: Array, most: int) -> float:
         """Actual rise of the cost when the pose moves by a step (3,), as a share of the rise that the slopes predict.
@@ -371,24 +346,20 @@ class Correspondences:
         # Points on one line share its error, which falls with the number of rays that the line was fitted to.
         _, line = np.unique(self._surface.line, return_inverse=True)
         shared = np.bincount(line)[line] / self._surface.rays
-        return self._weighted(self._weights * (1 + shared), self._slopes)
+        return _weighted(self._weights * (1 + shared), self._slopes)
 
     def delayed(self) -> Array:
         """Derivative (3, 3) of the gradient with respect to a twist within the scan that was not deskewed, s."""
-        return self._weighted(self._weights * self._delays, self._slopes)
+        return _weighted(self._weights * self._delays, self._slopes)
 
     def by_keyframe(self) -> dict[int, Array]:
         """Parts (3, 3) of the information, by the keyframe that saw the surface."""
-        parts = {}
-        for keyframe in np.unique(self._surface.keyframe):
-            chosen: NDArray[np.bool_] = self._surface.keyframe == keyframe
-            parts[int(keyframe)] = self._weighted(self._weights[chosen], self._slopes[chosen])
-        return parts
+        parts = {int(keyframe): self._surface.keyframe == keyframe for keyframe in np.unique(self._surface.keyframe)}
+        return {keyframe: _weighted(self._weights[part], self._slopes[part]) for keyframe, part in parts.items()}
 
-    @staticmethod
-    def _weighted(weights: Array, slopes: Array) -> Array:
-        product: Array = (weights[:, None] * slopes).T @ slopes
-        return product
+
+def _weighted(weights: Array, slopes: Array) -> Array:
+    return (weights[:, None] * slopes).T @ slopes
 
 
 def _slopes(directions: Array, seen: Array) -> Array:
@@ -474,18 +445,8 @@ def refine(
         inverses = np.divide(1.0, values, out=np.zeros(3), where=informative)
         weight = (limits[:, None] * directions) @ ((observability * inverses)[:, None] * directions.T) * limits
         pose = start + gain @ (pose - start) - weight @ pairs.gradient()
-    return Match(
-        pose,
-        gain,
-        observability,
-        directions,
-        weight,
-        information,
-        by_keyframe=pairs.by_keyframe(),
-        scatter=pairs.scatter(),
-        delayed=pairs.delayed(),
-        matched=pairs.matched,
-    )
+    errors = pairs.by_keyframe(), pairs.scatter(), pairs.delayed()
+    return Match(pose, gain, observability, directions, weight, information, *errors, pairs.matched)
 
 
 def _observability(pairs: Correspondences, directions: Array, information: Array) -> Array:
@@ -497,19 +458,11 @@ def _observability(pairs: Correspondences, directions: Array, information: Array
     if pairs.matched < LOST:
         return np.zeros(3)
     certain = pairs.certain_information(directions)
-    squares = np.square(certain)
-    observability: Array = squares / (1 + squares)
+    observability: Array = np.square(certain) / (1 + np.square(certain))
     suspect = (information < _SUSPECT * information[-1]) | (certain < _CERTAIN * information)
     for number in np.flatnonzero(suspect & (observability > _NOTHING)):
-        observability[number] *= _confirmed_share(pairs, directions[:, number])
+        # The share that a move of the scan confirms: the straight pieces fitted to a round wall lock with those of the
+        # map as if the wall had edges, but only close to where they are.
+        step = directions[:, number] / np.max(np.abs(directions[:, number]) / _TESTED)
+        observability[number] *= np.clip((pairs.rise(step, _MOST) - _FALSE) / (_TRUE - _FALSE), 0.0, 1.0)
     return observability
-
-
-def _confirmed_share(pairs: Correspondences, direction: Array) -> float:
-    """Share of the information along a direction (3,), 0 to 1, that a move of the scan along it confirms.
-
-    The straight pieces fitted to a round wall lock with those of the map as if the wall had edges, but only close to
-    where they are.
-    """
-    step = direction / np.max(np.abs(direction) / _TESTED)
-    return float(np.clip((pairs.rise(step, _MOST) - _FALSE) / (_TRUE - _FALSE), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""SLAM of a run, whose scans one after another become poses and a map, and of every run of a data set.
+"""SLAM of a run, whose scans one after another become poses and a map, and of every run of a data set; its accuracy.
 
 Covariance of the poses of SLAM and of the map that they made: a Schmidt-Kalman (consider) filter.
 
@@ -33,23 +33,31 @@ The first two terms are R x, so that the covariance of the pose, and that with a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
+from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
-from omnibench.errors import DataError, OmnibenchError
+from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
+from omnibench.data.true_poses import TruePath, read_true_poses, robot_of_truth
+from omnibench.errors import ConfigError, DataError, Interrupted, OmnibenchError
+from omnibench.files import TableFormat, refuse_existing, resolved
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, code_digest, content_key, run_jobs
 from omnibench.jobs.job_process import local_backend
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.kinematics import Array, JsonArray, relative, rotation
+from omnibench.robot.calibration import read_calibration
+from omnibench.robot.kinematics import Array, JsonArray, interpolated, moved_to, relative, rotated, rotation
 from omnibench.robot.model import OdometryModel
 from omnibench.slam import motion_prior
 from omnibench.slam.scan_matching import LOST, Match, ScanMap, ScanPoints, noise_factor, refine, scan_points, search
@@ -76,58 +84,39 @@ class PathWarning:
     """
 
     problem: str
-    along: complex | None = None
+    along: complex = 0j
     share: float | None = None
 
     def __str__(self) -> str:
         if self.share is not None:
             return self.problem.format(share=f"{100 * self.share:.0f} %")
-        if self.along is None:
+        if not self.along:
             return self.problem
         degrees = round(float(np.degrees(np.angle(self.along)) / 2)) % 180
         return f"{self.problem} along {degrees} deg of the run's frame"
 
 
-def path_warnings(matches: Sequence[Match], options: SlamOptions, odometry: Array | None) -> tuple[PathWarning, ...]:
+def path_warnings(matches: Sequence[Match], options: SlamOptions, odometry: Array | None) -> Iterator[PathWarning]:
     """Warnings about a run. odometry (S, 3): poses at the stamps of its scans, if it has any."""
-    return (*_weak_matches(matches), *([] if odometry is None else _disagreement(matches, options, odometry)))
-
-
-def merged_warning(warnings: Sequence[PathWarning]) -> PathWarning:
-    """One warning for several runs with one problem: along their mean direction, with the mean of their shares."""
-    directions = [warning.along for warning in warnings if warning.along is not None]
-    shares = [warning.share for warning in warnings if warning.share is not None]
-    return PathWarning(
-        warnings[0].problem, sum(directions) if directions else None, sum(shares) / len(shares) if shares else None
-    )
-
-
-def _weak_matches(matches: Sequence[Match]) -> Iterator[PathWarning]:
-    if any(match.matched < LOST for match in matches):
+    lost = [match.matched < LOST for match in matches]
+    weak = [match.observability.min() < _DEGENERATE for match in matches]
+    if any(lost):
         yield PathWarning("less than a fifth of a scan lies on the map, and its pose is the start of the search")
-    degenerate = [match for match in matches if match.matched >= LOST and match.observability.min() < _DEGENERATE]
-    if len(degenerate) <= _OFTEN * len(matches):
+    degenerate = [match for match, is_lost, is_weak in zip(matches, lost, weak, strict=True) if is_weak and not is_lost]
+    if len(degenerate) > _OFTEN * len(matches):
+        x, y, heading = np.array([match.directions[:, match.observability.argmin()] for match in degenerate]).T
+        if (np.abs(heading) > np.hypot(x, y)).mean() > 0.5:
+            yield PathWarning("scans tell too little of the heading")
+        else:
+            yield PathWarning("scans tell too little", complex(((x + 1j * y) ** 2).sum()))
+    if odometry is None:
         return
-    worst = np.array([match.directions[:, match.observability.argmin()] for match in degenerate])
-    x, y, heading = worst.T
-    if (np.abs(heading) > np.hypot(x, y)).mean() > 0.5:
-        yield PathWarning("scans tell too little of the heading")
-    else:
-        yield PathWarning("scans tell too little", complex(((x + 1j * y) ** 2).sum()))
-
-
-def _disagreement(matches: Sequence[Match], options: SlamOptions, odometry: Array) -> Iterator[PathWarning]:
-    """Compare motions from scan to scan in the robot's frame, so that an early error does not count again later."""
-    motions = [
-        (relative(*ours), relative(*theirs))
-        for ours, theirs, measured in zip(
-            pairwise(match.pose for match in matches),
-            pairwise(odometry),
-            pairwise(match.matched >= LOST and match.observability.min() >= _DEGENERATE for match in matches),
-            strict=True,
-        )
-        if all(measured) or options.start == "odometry"  # else a direction that is not measured shows no motion
-    ]
+    # Motions from scan to scan in the robot's frame, so that an early error does not count again later; where the
+    # search starts from the last pose, a direction that is not measured shows no motion.
+    measured = ~(np.array(lost) | weak) | (options.start == "odometry")
+    poses = np.array([match.pose for match in matches])
+    steps = np.flatnonzero(measured[:-1] & measured[1:])
+    motions = [(relative(*poses[step : step + 2]), relative(*odometry[step : step + 2])) for step in steps]
     if len(motions) < _FEWEST:
         return
     apart = _typical([ours - theirs for ours, theirs in motions])
@@ -268,11 +257,11 @@ def run_slam(
 ) -> SlamPath:
     """The poses at which a run's scans lie best on the map that they make.
 
-    start (3,): the robot's pose at the first scan. odometry: function from times (K,) >= 0, s, to poses (K, 3) in any
-    frame. Only its increments are used: to start the search, to deskew, and along directions that scans do not
-    measure. It is needed unless the search starts from the last pose. deviations (3,): standard deviations of the
-    start pose along the robot's axes, m, m, rad; default: it is exact. DataError in one line: no scan, or one without
-    returns.
+    start (3,): the robot's pose at the first scan. odometry: function from times (K,) >= 0, s, in any order, to poses
+    (K, 3) in any frame. Only its increments are used: to start the search, to deskew, and along directions that scans
+    do not measure. It is needed unless the search starts from the last pose. deviations (3,): standard deviations of
+    the start pose along the robot's axes, m, m, rad; default: it is exact. DataError in one line: no scan, or one
+    without returns.
     """
     if len(scans.times) == 0:
         raise DataError("SLAM: there is no scan")
@@ -294,60 +283,50 @@ def run_slam(
     if options.start == "odometry" and odometry is not None:
         motion = motion_prior.OdometryPrior(odometry, scans.times, duration, options)
     noise = noise_factor(scans.ranges[:: 1 + len(scans.times) // _SAMPLE], scanner)
-    errors = PoseErrors(start, deviations)
-    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), errors)
+    slam = _Slam(scanner, noise, options, motion, np.asarray(start, dtype=float), PoseErrors(start, deviations))
     located = [slam.begin(scans.ranges[0])]
     located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
-    # Among the times of scans several may be equal.
-    stamps, place = np.unique(scans.times, return_inverse=True)
-    return SlamPath(
-        scans.times,
-        np.array([match.pose for match, _ in located]),
-        np.array([covariance for _, covariance in located]),
-        np.array([match.matched for match, _ in located]),
-        path_warnings([match for match, _ in located], options, None if odometry is None else odometry(stamps)[place]),
-    )
+    matches, covariances = zip(*located, strict=True)
+    poses, matched = (np.array([getattr(match, name) for match in matches]) for name in ("pose", "matched"))
+    warnings = path_warnings(matches, options, None if odometry is None else odometry(scans.times))
+    return SlamPath(scans.times, poses, np.array(covariances), matched, tuple(warnings))
 
 
+@dataclass
 class _Slam:
     """SLAM in progress: the map so far, the last pose, and the errors of both."""
 
-    def __init__(
-        self,
-        scanner: Scanner,
-        noise: float,
-        options: SlamOptions,
-        motion: motion_prior.MotionPrior,
-        start: Array,
-        errors: PoseErrors,
-    ) -> None:
-        self._scanner, self._noise, self._options, self._motion = scanner, noise, options, motion
-        self._map = ScanMap(options.spacing)
-        self._errors = errors
-        self._pose = self._keyframe = start
+    scanner: Scanner
+    noise: float
+    options: SlamOptions
+    motion: motion_prior.MotionPrior
+    pose: Array
+    errors: PoseErrors
+
+    def __post_init__(self) -> None:
+        self.map, self.keyframe = ScanMap(self.options.spacing), self.pose
 
     def begin(self, ranges: Ranges) -> tuple[Match, Array]:
         """The first scan, with which the map begins, at the start pose; its covariance (3, 3)."""
-        within, deviations = self._motion.first()
-        if not self._options.deskew:
-            deviations = within.mean
+        within, deviations = self.motion.first()
+        deviations = deviations if self.options.deskew else within.mean
         scan = self._points(ranges, within)
         self._add(scan, deviations)
-        match = replace(refine(self._map, scan, self._pose, self._pose, self._options), pose=self._pose)
+        match = replace(refine(self.map, scan, self.pose, self.pose, self.options), pose=self.pose)
         # Uncertainty of the start pose, and of this scan, to which the following are matched.
-        scatter = np.linalg.inv(match.information + np.diag(self._options.limits**-2.0))
-        return match, self._errors.covariance + scatter
+        scatter = np.linalg.inv(match.information + np.diag(self.options.limits**-2.0))
+        return match, self.errors.covariance + scatter
 
     def go_on(self, number: int, ranges: Ranges) -> tuple[Match, Array]:
         """The next scan: its match and the covariance of its pose (3, 3)."""
-        options, motion, last = self._options, self._motion, self._pose
+        options, motion, last = self.options, self.motion, self.pose
         predicted = motion.predict(number, last)
         scan = self._points(ranges, predicted.within)
-        pose = search(self._map, scan, predicted.start, options)
+        pose = search(self.map, scan, predicted.start, options)
         raw = scan
         correction: Array = np.zeros(3)
         for _ in range(_CORRECTIONS):
-            pose = refine(self._map, scan, pose, predicted.start, options, steps=1).pose
+            pose = refine(self.map, scan, pose, predicted.start, options, steps=1).pose
             before = correction
             correction, deviations = motion.correct(number, last, pose, before)
             if not options.deskew:
@@ -356,36 +335,36 @@ class _Slam:
             scan = raw.deskewed(correction)
             if not self._skews(correction - before):
                 break
-        match = refine(self._map, scan, pose, predicted.start, options)
-        covariance = self._errors.step(match, predicted.deviations, deviations)
-        self._pose = match.pose
+        match = refine(self.map, scan, pose, predicted.start, options)
+        covariance = self.errors.step(match, predicted.deviations, deviations)
+        self.pose = match.pose
         # New surfaces once the robot has come far enough; a scan that may be skewed waits while it can.
-        x, y, turned = match.pose - self._keyframe
-        far = np.hypot(x, y) > self._options.keyframe_distance or abs(turned) > self._options.keyframe_angle
-        if bool(far and (match.matched < _NEEDED or not self._skews(deviations))) or not self._map.is_usable:
+        x, y, turned = match.pose - self.keyframe
+        far = np.hypot(x, y) > options.keyframe_distance or abs(turned) > options.keyframe_angle
+        if bool(far and (match.matched < _NEEDED or not self._skews(deviations))) or not self.map.is_usable:
             self._add(scan, deviations)
         return match, covariance
 
     def _skews(self, twist: Array) -> bool:
         """True if an error (3,) of the twist during a scan, m/s, m/s, rad/s, matters."""
-        return bool(np.abs(twist).max() * self._scanner.delays[-1] > _SKEWED)
+        return bool(np.abs(twist).max() * self.scanner.delays[-1] > _SKEWED)
 
     def _points(self, ranges: Ranges, within: motion_prior.MotionWithinScan) -> ScanPoints:
         still = motion_prior.MotionWithinScan.steady(np.zeros(3), within.duration)
-        return scan_points(ranges, self._scanner, self._noise, within if self._options.deskew else still)
+        return scan_points(ranges, self.scanner, self.noise, within if self.options.deskew else still)
 
     def _add(self, scan: ScanPoints, deviations: Array) -> None:
         """Make the last pose a keyframe, if its scan saw something new.
 
         deviations (3,): standard deviations of the twist within the scan, m/s, m/s, rad/s.
         """
-        self._keyframe = self._pose
-        if not self._map.add(scan.lines, self._pose, self._errors.keyframes):
+        self.keyframe = self.pose
+        if not self.map.add(scan.lines, self.pose, self.errors.keyframes):
             return
-        self._errors.keep(deviations * self._scanner.delays[-1] / 2)
-        if self._errors.keyframes > _KEYFRAMES:
-            self._map.merge_oldest()
-            self._errors.merge_oldest()
+        self.errors.keep(deviations * self.scanner.delays[-1] / 2)
+        if self.errors.keyframes > _KEYFRAMES:
+            self.map.merge_oldest()
+            self.errors.merge_oldest()
 
 
 _AT_START = 1e-6  # s: rounding of stamps; a scan that is nearer to t = 0 counts as taken at t = 0
@@ -434,23 +413,22 @@ def slam_paths(
         if trajectory.id not in known:
             raise DataError(f"data set {dataset.name}: trajectory {trajectory.id} has no scans; leave it out for SLAM")
     model = model or OdometryModel.of_design(dataset.robot, "arc")
-    jobs = (
-        _Run(trajectory, scans.of(trajectory.id), scans.scanner, options, model, dataset.name).job()
-        for trajectory in dataset.trajectories
-    )
+    # The key covers all that a path depends on.
+    of_model = [model.robot, model.matrix, model.integration, model.sample_period]
+    terms = [[term.name, dict(term.values)] for term in model.terms]
+    facts = {"scanner": scans.scanner, "options": options, "model": of_model, "terms": terms, "code": _code()}
+
+    def job(run: Trajectory) -> Job[SlamPath]:
+        recorded = scans.of(run.id)
+        argument = dataset.name, run, recorded, scans.scanner, options, model
+        return Job(content_key({"run": run, "scans": recorded, **facts}), _locate, argument)
+
     paths = _Paths(dataset, watch)
-    with _store(folder) as store:
-        run_jobs(jobs, store, local_backend(min(workers, len(dataset.trajectories)), PRELOAD), paths)
-    return [paths.found[number] for number in range(len(dataset.trajectories))]
-
-
-@contextmanager
-def _store(folder: Path | None) -> Iterator[ResultStore[SlamPath]]:
-    if folder is not None:
-        yield ResultStore(folder, SlamPath)
-        return
     with TemporaryDirectory(prefix="omnibench-slam-") as temporary:
-        yield ResultStore(Path(temporary), SlamPath)
+        store = ResultStore(folder or Path(temporary), SlamPath)
+        backend = local_backend(min(workers, len(dataset.trajectories)), PRELOAD)
+        run_jobs(map(job, dataset.trajectories), store, backend, paths)
+    return [paths.found[number] for number in range(len(dataset.trajectories))]
 
 
 class _Paths(JobWatch[SlamPath]):
@@ -463,10 +441,8 @@ class _Paths(JobWatch[SlamPath]):
 
     def ended(self, number: int, ending: SlamPath | Failure, reused: bool) -> None:  # noqa: ARG002
         if isinstance(ending, Failure):
-            run = self._dataset.trajectories[number].id
-            raise ending.error or OmnibenchError(
-                f"data set {self._dataset.name}: trajectory {run}: SLAM: {ending.reason}; is there too little memory?"
-            )
+            run = f"data set {self._dataset.name}: trajectory {self._dataset.trajectories[number].id}"
+            raise ending.error or OmnibenchError(f"{run}: SLAM: {ending.reason}; is there too little memory?")
         self.found[number] = ending
         self._tell()
 
@@ -476,54 +452,26 @@ class _Paths(JobWatch[SlamPath]):
 
 def with_paths(dataset: Dataset, paths: Sequence[SlamPath]) -> Dataset:
     """The data set with the poses, times and covariances of ``paths``, whose warnings are added to its own."""
-    made = make_dataset(
-        dataset.name,
-        dataset.robot,
-        dataset.sample_period,
-        [_with_path(trajectory, path) for trajectory, path in zip(dataset.trajectories, paths, strict=True)],
-        description=dataset.description,
-        source=dataset.source,
-        licence=dataset.licence,
-        simulated=dataset.simulated,
-        scans=dataset.scans,
-    )
-    # One sentence for a problem that several runs have.
-    by_problem: dict[str, list[tuple[str, PathWarning]]] = {}
-    for trajectory, path in zip(dataset.trajectories, paths, strict=True):
+    runs, by_problem = [], defaultdict[str, list[tuple[str, PathWarning]]](list)
+    for run, path in zip(dataset.trajectories, paths, strict=True):
+        # Data sets hold symmetric covariances.
+        covariances = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2
+        runs.append(replace(run, pose_times=path.times, poses=path.poses, pose_covariances=covariances))
         for warning in path.warnings:
-            by_problem.setdefault(warning.problem, []).append((trajectory.id, warning))
-    warnings = (
-        f"SLAM: {merged_warning([warning for _, warning in concerned])}: {len(concerned)} of {len(paths)} runs, "
-        f"e.g. {', '.join(run for run, _ in concerned[:3])}"
-        for concerned in by_problem.values()
+            by_problem[warning.problem].append((run.id, warning))
+    described: dict[str, Any] = {name: getattr(dataset, name) for name in ("description", "source", "licence")}
+    simulated, scans = dataset.simulated, dataset.scans
+    made = make_dataset(
+        dataset.name, dataset.robot, dataset.sample_period, runs, simulated=simulated, scans=scans, **described
     )
+    warnings = []
+    for problem, concerned in by_problem.items():  # of several runs: along their mean direction, with the mean share
+        shares = [warning.share for _, warning in concerned if warning.share is not None]
+        along = sum((warning.along for _, warning in concerned), 0j)
+        mean = PathWarning(problem, along, sum(shares) / len(shares) if shares else None)
+        names = ", ".join(run for run, _ in concerned[:3])
+        warnings.append(f"SLAM: {mean}: {len(concerned)} of {len(paths)} runs, e.g. {names}")
     return replace(made, warnings=(*made.warnings, *warnings))
-
-
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """A run of the data set called ``dataset``, and how its path is searched."""
-
-    trajectory: Trajectory
-    scans: TrajectoryScans
-    scanner: Scanner
-    options: SlamOptions
-    model: OdometryModel
-    dataset: str
-
-    def job(self) -> Job[SlamPath]:
-        """The search for its path; the key covers all that the path depends on."""
-        model = self.model
-        facts = {
-            "run": self.trajectory,
-            "scans": self.scans,
-            "scanner": self.scanner,
-            "options": self.options,
-            "model": [model.robot, model.matrix, model.integration, model.sample_period],
-            "terms": [[term.name, dict(term.values)] for term in model.terms],
-            "code": _code(),
-        }
-        return Job(content_key(facts), _locate, self)
 
 
 @cache
@@ -533,41 +481,329 @@ def _code() -> str:
     return code_digest(package, (file for room in ("robot", "data", "slam") for file in (package / room).rglob("*.py")))
 
 
-def _locate(run: _Run, _: Reporter) -> SlamPath:
-    """The path of one run from t = 0 on."""
-    trajectory = run.trajectory
-    kept = run.scans.times >= -_AT_START
-    scans = TrajectoryScans(np.maximum(run.scans.times[kept], 0.0), run.scans.ranges[kept])
+def _locate(
+    argument: tuple[str, Trajectory, TrajectoryScans, Scanner, SlamOptions, OdometryModel], _: Reporter
+) -> SlamPath:
+    """The path of one run from t = 0 on. argument: name of its data set, run, scans, scanner, options, odometry."""
+    dataset, trajectory, recorded, scanner, options, model = argument
+    kept = recorded.times >= -_AT_START
+    scans = TrajectoryScans(np.maximum(recorded.times[kept], 0.0), recorded.ranges[kept])
 
     def odometry(times: Array) -> Array:
         stamps, place = np.unique(times, return_inverse=True)
-        return run.model.poses([trajectory.log(stamps)])[0][place]
+        return model.poses([trajectory.log(stamps)])[0][place]
 
     try:
         if not len(scans.times):
             raise DataError("SLAM: no scan at or after t = 0")
         if scans.times[0] <= _AT_START:
-            return run_slam(scans, run.scanner, run.options, trajectory.start, odometry)
+            return run_slam(scans, scanner, options, trajectory.start, odometry)
         # The way along x and y and the turn before the first scan, m, m, rad; motion back and forth adds up.
         until = float(scans.times[0])
         poses = odometry(np.linspace(0.0, until, 2 + int(until / _STEP)))
         driven = np.sum([np.abs(relative(one, other)) for one, other in pairwise(poses)], axis=0)
-        deviations = motion_prior.odometry_deviations(driven, run.options.odometry_error)
-        path = run_slam(scans, run.scanner, run.options, poses[-1], odometry, deviations)
+        deviations = motion_prior.odometry_deviations(driven, options.odometry_error)
+        path = run_slam(scans, scanner, options, poses[-1], odometry, deviations)
     except DataError as error:
-        raise DataError(f"data set {run.dataset}: trajectory {trajectory.id}: {error}") from None
+        raise DataError(f"data set {dataset}: trajectory {trajectory.id}: {error}") from None
     # The start pose at t = 0 stands before the path of a run whose first scan comes later.
     late = "the robot moves before the first scan, whose pose is therefore as uncertain as the odometry"
-    return replace(
-        path,
-        warnings=(*path.warnings, PathWarning(late)) if motion_prior.length(driven) > _FAR else path.warnings,
-        times=np.concatenate([[0.0], path.times]),
-        poses=np.vstack([trajectory.start, path.poses]),
-        covariances=np.concatenate([FLOOR[None], path.covariances]),
-        matched=np.concatenate([path.matched[:1], path.matched]),
+    return SlamPath(
+        np.append(0.0, path.times),
+        np.vstack([trajectory.start, path.poses]),
+        np.concatenate([FLOOR[None], path.covariances]),
+        np.append(path.matched[:1], path.matched),
+        (*path.warnings, PathWarning(late)) if motion_prior.length(driven) > _FAR else path.warnings,
     )
 
 
-def _with_path(trajectory: Trajectory, path: SlamPath) -> Trajectory:
-    symmetric = (path.covariances + np.swapaxes(path.covariances, 1, 2)) / 2  # data sets hold symmetric covariances
-    return replace(trajectory, pose_times=path.times, poses=path.poses, pose_covariances=symmetric)
+# Share of the largest variance below which a covariance counts as singular: rounding of its eigenvalues.
+_SINGULAR = 1e-14
+
+
+class ErrorSummary(Model):
+    """Errors of poses. The bias is the mean error along the robot's axes, the systematic part of the error."""
+
+    poses: int
+    position_mean_m: float
+    position_p95_m: float
+    position_max_m: float
+    heading_mean_rad: float
+    heading_p95_rad: float
+    heading_max_rad: float
+    bias_forward_m: float
+    bias_left_m: float
+    bias_heading_rad: float
+    nees_mean: float | None = Field(
+        description="mean of error' covariance^-1 error; 3 for honest covariances; singular ones are left out"
+    )
+
+
+class SlamAccuracy(Model):
+    """Errors of the last pose of every run, and of all poses but the start poses."""
+
+    runs: int
+    distance_m: float = Field(description="driven in all")
+    final: ErrorSummary
+    every: ErrorSummary
+    drift_position: float = Field(description="growth of the position's error, m per m driven")
+    drift_heading: float = Field(description="growth of the heading's error, rad per m driven")
+
+
+def slam_accuracy(poses: Dataset, truth: Mapping[str, TruePath]) -> SlamAccuracy:
+    """Errors of a data set's reference poses against the true paths.
+
+    DataError in one line: a run is not in the truth, or has no pose after its start.
+    """
+    place = f"data set {poses.name}"
+    _check_truth(truth, poses, place)
+    for run in poses.trajectories:
+        if not run.has_poses:
+            raise DataError(f"{place}: trajectory {run.id} has no pose after its start")
+    errors = [run_errors(run, truth[run.id]) for run in poses.trajectories]
+    driven = np.concatenate([run.driven for run in errors])
+    return SlamAccuracy(
+        runs=len(errors),
+        distance_m=sum(float(run.driven[-1]) for run in errors),
+        final=_summary([run.of(slice(-1, None)) for run in errors]),
+        every=_summary(errors),
+        drift_position=_growth(driven, np.concatenate([run.position for run in errors])),
+        drift_heading=_growth(driven, np.concatenate([run.heading for run in errors])),
+    )
+
+
+def _check_truth(truth: Mapping[str, TruePath], dataset: Dataset, place: str) -> None:
+    for run in dataset.trajectories:
+        if run.id not in truth:
+            raise DataError(f"{place}: trajectory {run.id} is not in the truth; name that of this data set")
+
+
+@dataclass(frozen=True, eq=False)
+class RunErrors:
+    """Errors of a run's reference poses after the first.
+
+    times (K,): times of the poses, s. driven (K,): true distance driven until then, m. in_robot (K, 3): errors along
+    the robot's axes, m, m, rad. nees (K,): error' covariance^-1 error, NaN where the covariance is singular; None
+    without covariances.
+    """
+
+    times: Array
+    driven: Array
+    in_robot: Array
+    nees: Array | None
+
+    @property
+    def position(self) -> Array:
+        """Magnitudes (K,) of the position's errors, m."""
+        return np.hypot(self.in_robot[:, 0], self.in_robot[:, 1])
+
+    @property
+    def heading(self) -> Array:
+        """Magnitudes (K,) of the heading's errors, rad."""
+        return np.abs(self.in_robot[:, 2])
+
+    def of(self, poses: slice | NDArray[np.bool_]) -> RunErrors:
+        """The errors of some of the poses."""
+        nees = None if self.nees is None else self.nees[poses]
+        return RunErrors(self.times[poses], self.driven[poses], self.in_robot[poses], nees)
+
+
+def run_errors(trajectory: Trajectory, truth: TruePath) -> RunErrors:
+    """Errors of a run's reference poses after the first, at their stamps; the true path begins at the run's start."""
+    times = trajectory.pose_times[1:]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T))])
+    true = TruePath(truth.times, moved_to(trajectory.start, truth.poses)).at(times)
+    errors = trajectory.poses[1:] - true
+    nees = None
+    if (covariances := trajectory.pose_covariances) is not None:  # e' C^-1 e
+        values, directions = np.linalg.eigh(covariances[1:])
+        regular = values[:, 0] > _SINGULAR * values[:, -1]
+        along = np.einsum("kij,ki->kj", directions[regular], errors[regular])
+        nees = np.full(len(errors), np.nan)
+        nees[regular] = (along**2 / values[regular]).sum(axis=1)
+    in_robot = np.column_stack([rotated(errors, -true[:, 2]), errors[:, 2]])
+    return RunErrors(times, np.interp(times, truth.times, way), in_robot, nees)
+
+
+def _summary(runs: Sequence[RunErrors]) -> ErrorSummary:
+    errors = np.concatenate([run.in_robot for run in runs])
+    nees = np.concatenate([np.zeros(0), *(run.nees for run in runs if run.nees is not None)])
+    nees = nees[np.isfinite(nees)]
+    bias = dict(zip(("bias_forward_m", "bias_left_m", "bias_heading_rad"), errors.mean(axis=0).tolist(), strict=True))
+    return ErrorSummary(**_spread(errors), **bias, nees_mean=float(nees.mean()) if len(nees) else None)
+
+
+def _spread(errors: Array) -> dict[str, float]:
+    """Number of errors (K, 3), and mean, 95 % quantile and maximum of their positions and headings."""
+    sizes = {"position_{}_m": np.hypot(errors[:, 0], errors[:, 1]), "heading_{}_rad": np.abs(errors[:, 2])}
+    spread: dict[str, float] = {"poses": len(errors)}
+    for name, size in sizes.items():
+        spread |= {name.format("mean"): float(size.mean()), name.format("p95"): float(np.quantile(size, 0.95))}
+        spread[name.format("max")] = float(size.max())
+    return spread
+
+
+def _growth(driven: Array, sizes: Array) -> float:
+    """Slope k of error^2 = noise^2 + (k distance)^2 by least squares; 0 where errors do not grow."""
+    ways = driven**2 - (driven**2).mean()
+    spread = float(ways @ ways)
+    return float(np.sqrt(max(0.0, ways @ sizes**2 / spread))) if spread > 0 else 0.0
+
+
+_SAME_TIME = 1e-6  # s: rounding of stamps; poses that are nearer in time are of the same time
+
+
+class Distances(Model):
+    """Distances between two sets of poses of the same runs and times, without the start poses."""
+
+    poses: int
+    position_mean_m: float
+    position_p95_m: float
+    heading_mean_rad: float
+    heading_p95_rad: float
+
+
+class SlamSummary(Model):
+    """SLAM of a data set. Deviations are the standard deviations that SLAM states for the runs' last poses."""
+
+    dataset: str
+    simulated: bool
+    runs: int
+    scans: int
+    matched_mean: float = Field(description="share of a scan's points that lie on the map, mean over all scans")
+    matched_min: float = Field(description="matched share of the worst scan")
+    position_deviation_mean_m: float = Field(description="along the least certain direction; mean over runs")
+    position_deviation_max_m: float = Field(description="along the least certain direction; worst run")
+    heading_deviation_mean_rad: float
+    heading_deviation_max_rad: float
+    recorded: Distances | None = Field(
+        description="distance from the poses that the data set held before; None: not comparable"
+    )
+    accuracy: SlamAccuracy | None = Field(description="against the truth of a simulation, if that is known")
+    warnings: tuple[str, ...]
+
+
+def summarise(
+    before: Dataset, after: Dataset, paths: Sequence[SlamPath], accuracy: SlamAccuracy | None = None
+) -> SlamSummary:
+    """Summary of SLAM. before: the data set with its recorded poses. after: with the poses of ``paths``."""
+    matched = np.concatenate([path.matched for path in paths])
+    last = np.array([path.covariances[-1] for path in paths])
+    position = np.sqrt(np.linalg.eigvalsh(last[:, :2, :2])[:, -1])
+    heading = np.sqrt(last[:, 2, 2])
+    return SlamSummary(
+        dataset=after.name,
+        simulated=after.simulated,
+        runs=len(paths),
+        scans=sum(len(before.scans.times(run.id)) for run in before.trajectories) if before.scans else 0,
+        matched_mean=float(matched.mean()),
+        matched_min=float(matched.min()),
+        position_deviation_mean_m=float(position.mean()),
+        position_deviation_max_m=float(position.max()),
+        heading_deviation_mean_rad=float(heading.mean()),
+        heading_deviation_max_rad=float(heading.max()),
+        recorded=distances(before, after),
+        accuracy=accuracy,
+        warnings=after.warnings,
+    )
+
+
+def distances(one: Dataset, other: Dataset) -> Distances | None:
+    """Distances between the reference poses of two data sets of the same runs; None when they have no common times.
+
+    Compared at the stamps of the data set with fewer poses; the other's poses are interpolated by straight lines.
+    """
+    parts = []
+    for runs in zip(one.trajectories, other.trajectories, strict=True):
+        sparse, dense = sorted(runs, key=lambda run: len(run.pose_times))
+        times, within = sparse.pose_times, dense.pose_times[[0, -1]] + [-_SAME_TIME, _SAME_TIME]
+        common = (times > _SAME_TIME) & (times >= within[0]) & (times <= within[1])
+        turns = np.round((sparse.poses[0, 2] - dense.poses[0, 2]) / (2 * np.pi))  # only these are taken away
+        there = interpolated(times[common], dense.pose_times, dense.poses)
+        parts.append(sparse.poses[common] - there - [0.0, 0.0, 2 * np.pi * turns])
+    if not len(errors := np.concatenate(parts)):
+        return None
+    return Distances(**{name: value for name, value in _spread(errors).items() if name in Distances.model_fields})
+
+
+_WORKERS = 2  # processes at a time: results do not depend on their number
+
+
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """The data set with its new poses, their summary, and the true paths, if they are known."""
+
+    dataset: Dataset
+    summary: SlamSummary
+    truth: Mapping[str, TruePath] | None
+
+
+@dataclass(frozen=True)
+class SlamRequest:
+    """Arguments of ``omnibench slam``.
+
+    dataset: folder of the recording. output: folder to write with the new poses; None: none. model: a calibration file,
+    whose odometry the search starts from; None: the design values. truth: the folder that ``simulate --truth`` wrote.
+    force: replace the data set that is in ``output``. ConfigError in one line: the recording would be written over.
+    """
+
+    dataset: Path
+    output: Path | None = None
+    options: SlamOptions = field(default_factory=SlamOptions)
+    model: Path | None = None
+    truth: Path | None = None
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        if self.output is not None and resolved(self.output) == resolved(self.dataset):
+            raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
+        if self.model is not None and self.options.start != "odometry":
+            raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
+
+    def run(self, watch: Reporter = no_progress, table_format: TableFormat = "parquet") -> SlamResult:
+        """Find the poses and write the data set. DataError in one line, before the work where that can be.
+
+        Until the data set is written, the paths found so far are kept in a folder beside it, with which the command
+        goes on when it is run again. Interrupted: Ctrl-C; the message names that folder, as a note of any error does.
+        """
+        recorded, truth, model = load_dataset(self.dataset), None, None
+        if self.truth is not None:
+            truth = read_true_poses(self.truth)
+            if robot_of_truth(self.truth) not in (None, recorded.robot):
+                raise DataError(f"--truth {self.truth}: it is another robot's; name the truth of this data set")
+            _check_truth(truth, recorded, f"--truth {self.truth}")
+        if self.model is not None:
+            calibration = read_calibration(self.model)
+            calibration.check_wheels(recorded.robot, f"the data set {recorded.name}", place=f"--model {self.model}: ")
+            model = calibration.model
+        if self.output is not None:
+            check_dataset_folder(self.output)
+            going_on = any(_paths_beside(self.output).glob("*.json"))  # stopped before the data set was complete
+            refuse_existing(self.output, force=self.force or going_on, folders=True)
+        # Terms of plug-ins, whose classes other processes do not know and no path's key covers.
+        terms = () if model is None else model.terms
+        local = not all(type(term.effect).__module__.startswith("omnibench.") for term in terms)
+        folder = None if local or self.output is None else _paths_beside(self.output)
+        try:
+            workers = 1 if local else _WORKERS
+            paths = slam_paths(recorded, self.options, model=model, workers=workers, folder=folder, watch=watch)
+            found = with_paths(recorded, paths)
+            if self.output is not None:
+                save_dataset(found, self.output, table_format, overwrite=self.force)
+        except (KeyboardInterrupt, Exception) as error:
+            if folder is None or not any(folder.glob("*.json")):
+                raise
+            kept = f"the paths found so far are kept in {folder}"
+            if isinstance(error, KeyboardInterrupt):
+                raise Interrupted(f"interrupted; {kept}: run the command again") from None
+            error.add_note(kept)
+            raise
+        if folder is not None:
+            ResultStore(folder, SlamPath).remove()
+        accuracy = None if truth is None else slam_accuracy(found, truth)
+        return SlamResult(found, summarise(recorded, found, paths, accuracy), truth)
+
+
+def _paths_beside(output: Path) -> Path:
+    named = output if output.name not in ("", "..") else resolved(output)
+    return named.with_name(f"{named.name}.slam-paths")

@@ -18,35 +18,24 @@ class SlamOptions(Model):
     """Options of SLAM. The defaults suit a robot indoors, up to 0.5 m/s and 1 rad/s with four scans a second."""
 
     start: Literal["odometry", "last_pose"] = Field(
-        "odometry",
-        description="where the search for a scan's pose starts; kept along directions that the scans do not measure",
+        "odometry", description="where the search for a scan's pose starts; kept along what the scans do not measure"
     )
     deskew: bool = Field(True, description="undo the robot's motion within a scan")
-    search_distance: Positive = Field(
-        1.0, le=10, description="m; points farther from the map are not matched in the first search"
-    )
-    match_distance: Positive = Field(
-        0.15, le=10, description="m; points farther from the map are not matched once the pose is roughly known"
-    )
+    search_distance: Positive = Field(1.0, le=10, description="m; the first search matches no points farther apart")
+    match_distance: Positive = Field(0.15, le=10, description="m; as search_distance, once the pose is roughly known")
     spacing: FiniteFloat = Field(0.1, gt=0.005, le=1, description="m between points of the map")
     keyframe_distance: Positive = Field(0.25, description="m; distance after which a scan adds new surfaces to the map")
     keyframe_angle: Positive = Field(0.2, description="rad; turn after which a scan does so")
-    constrained_position: Positive = Field(
-        0.02, description="m; along directions that a scan measures less precisely, the start is kept"
-    )
+    constrained_position: Positive = Field(0.02, description="m; along what a scan tells worse, the start is kept")
     constrained_heading: Positive = Field(0.01, description="rad; as constrained_position, for the heading")
-    odometry_error: Positive = Field(
-        0.1, description="standard deviation of the odometry's error, as a share of the distance"
-    )
+    odometry_error: Positive = Field(0.1, description="standard deviation of odometry, as a share of the distance")
     speed: Positive = Field(0.5, description="m/s; greatest speed, for start last_pose")
     turn_rate: Positive = Field(1.0, description="rad/s; greatest rate of turn, for start last_pose")
 
     @model_validator(mode="after")
     def _narrows(self) -> SlamOptions:
-        if self.search_distance < self.match_distance:
-            raise ValueError(
-                f"search_distance {self.search_distance:g} m is less than match_distance {self.match_distance:g} m"
-            )
+        if (search := self.search_distance) < self.match_distance:
+            raise ValueError(f"search_distance {search:g} m is less than match_distance {self.match_distance:g} m")
         return self
 
     @property

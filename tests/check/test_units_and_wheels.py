@@ -210,7 +210,7 @@ def test_copies_of_training_runs_are_left_out_of_validation() -> None:
     runs = [first, second, copies[0], replace(copies[1], poses=poses)]
     dataset = make_dataset("x", flowers.robot, flowers.sample_period, runs)
     assert [run.id for run in dataset.split("validation")] == ["other"]
-    assert "1 trajectory is a copy of a training run and is left out of validation: copy" in dataset.warnings
+    assert "left out of validation, as copies of training runs: copy" in dataset.warnings
 
 
 @pytest.mark.parametrize(("motion", "robot"), [*((motion, "apr02") for motion in MOTIONS), ("flower", "mecanum")])

@@ -37,7 +37,7 @@ from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, measure_scans, scan_stamps
-from omnibench.slam.slam_request import distances
+from omnibench.slam.slam_dataset import distances
 from omnibench.testing.synthetic import PERIOD, synthetic_robot, synthetic_trajectories, true_robot
 
 ROBOT = synthetic_robot()
@@ -192,7 +192,7 @@ def test_the_truth_gives_errors_bias_and_drift_and_a_report(command: Command, dr
         (["DATA", "-o", "found", "--set", "spacng=1"], ["slam --set", "'spacng'", "'spacing'"]),
         (["DATA", "-o", "found", "--set", "spacing=-1"], ["slam --set: spacing: ", "given: -1"]),
         (["DATA", "-o", "found", "--truth", "nowhere"], ["nowhere: no poses.parquet"]),
-        (["DATA", "-o", "found", "--truth", "OTHER"], ["trajectory 01 is not in it"]),
+        (["DATA", "-o", "found", "--truth", "OTHER"], ["trajectory 01 is not in the truth"]),
         (["DATA", "-o", "found", "--model", "nowhere"], ["nowhere: no such file"]),
         (["DATA", "-o", "found", "--model", "x.yaml", "--start", "last_pose"], ["--model x.yaml", "--start odometry"]),
         (["DATA", "-o", "found", "--model", "FOUR"], ["fl, fr, rl, rr", "a, b, c"]),
@@ -287,7 +287,7 @@ def test_errors_keep_paths(command: Command, driven: Driven, tmp_path: Path, mon
 
 def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: Path) -> None:
     program = "import os, signal, sys, threading; sys.argv[0] = 'omnibench'; "
-    program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_request; "
+    program += "from omnibench.__main__ import main; import omnibench.cli.app, omnibench.slam.slam_dataset; "
     program += "threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start(); main()"
     run = python(program, "slam", driven.data, "-o", "found", cwd=tmp_path, env=ENVIRONMENT)
     assert run.returncode == 130

@@ -14,8 +14,9 @@ from scipy.stats import t
 
 import omnibench
 from omnibench.data.clock_matching import ClockMatch, Streams, match_clocks, median_period
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset, unwrap
+from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.recording import PoseReadings
+from omnibench.data.references import unwrap
 from omnibench.data.runs import align
 from omnibench.robot.kinematics import Array, wheel_equations
 from omnibench.robot.model import OdometryModel

@@ -221,7 +221,7 @@ def test_poses_after_the_last_wheel_sample_are_warned_of() -> None:
     run = a_trajectory("late", 0.3)
     late = replace(run, pose_times=np.array([0.0, 0.2, 1.0]))
     (warning,) = make_dataset("late", APR_02, 0.1, [run, late][1:]).warnings[-1:]
-    assert warning == "1 trajectory has reference poses after its last wheel sample, e.g. late"
+    assert warning == "1 trajectory with reference poses after the last wheel sample: late"
 
 
 # What is done, the file and perhaps the row that the message must name, and what it must say.
@@ -264,7 +264,7 @@ REFUSED: list[tuple[Change, str, str]] = [
     (header("sample_perod", 0.1), "dataset.yaml: ", "did you mean 'sample_period'?"),
     (header("sample_period", 0), "dataset.yaml: ", "sample_period"),
     (header("wheels", ["a", "b", "d"]), "dataset.yaml: ", "a, b, d"),
-    (header("wheels", ["c", "b", "a"]), "dataset.yaml: ", "the same order"),
+    (header("wheels", ["c", "b", "a"]), "dataset.yaml: ", "in this order"),
 ]
 REFUSED_STEERING: list[tuple[Change, str, str]] = [
     (drop_column("wheels", "steer_front"), "wheels.{x}: ", "column 'steer_front'"),

@@ -37,7 +37,7 @@ from omnibench.report.recording.section import has_recording, player, recording_
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.slam_request import run_errors, slam_accuracy
+from omnibench.slam.slam_dataset import run_errors, slam_accuracy
 
 CONTENTS = "What was recorded"
 

@@ -30,9 +30,16 @@ from omnibench.simulate.floor_plan import FloorPlan, RoomPlan, make_plan
 from omnibench.simulate.lidar import Lidar, LidarMount
 from omnibench.slam.import_dataset import import_dataset
 from omnibench.slam.motion_prior import LastPosePrior, OdometryPrior, smoothed
-from omnibench.slam.slam_dataset import FLOOR, SlamPath, run_slam, slam_dataset
+from omnibench.slam.slam_dataset import (
+    FLOOR,
+    SlamPath,
+    distances,
+    run_errors,
+    run_slam,
+    slam_accuracy,
+    slam_dataset,
+)
 from omnibench.slam.slam_options import SlamOptions
-from omnibench.slam.slam_request import distances, run_errors, slam_accuracy
 from omnibench.testing.synthetic import synthetic_dataset
 
 LIDAR = Lidar()

@@ -20,7 +20,7 @@ from omnibench import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.simulate.config import RobotConfig
 from omnibench.simulate.source import read_simulation, simulate_dataset
-from omnibench.slam.slam_request import slam_accuracy
+from omnibench.slam.slam_dataset import slam_accuracy
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "apr02_robot.yaml"
 ARTEFACTS = frozenset({"motor_lag", "motor_gain", "motor_dead_band", "reference_time_offset"})

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from omnibench.check.check import CheckReport
     from omnibench.design.design import Design
     from omnibench.fit.inspect import Inspection
-    from omnibench.slam.slam_request import SlamAccuracy, SlamSummary
+    from omnibench.slam.slam_dataset import SlamAccuracy, SlamSummary
 
 _COLOURS = {
     "ready": "bold green", "fix": "bold red", "record more": "bold yellow",

@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from omnibench.config import Positive
-from omnibench.data.aligned import WheelSamples, measured_as
 from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers import bags
@@ -49,7 +48,7 @@ from omnibench.data.recording import (
     words_of,
 )
 from omnibench.data.references import Reference, ReferenceKind, References
-from omnibench.data.runs import dataset_of, find_rests
+from omnibench.data.runs import WheelSamples, dataset_of, find_rests, measured_as
 from omnibench.data.scans import Mount
 from omnibench.data.splits import Names
 from omnibench.data.spoiled_references import follows_the_wheels

@@ -25,7 +25,7 @@ from omnibench.report.recording import recording_figures
 from omnibench.report.style import INK, PALETTE, QUIET, plot
 from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.slam_request import ErrorSummary, RunErrors, SlamAccuracy, SlamSummary, run_errors, slam_accuracy
+from omnibench.slam.slam_dataset import ErrorSummary, RunErrors, SlamAccuracy, SlamSummary, run_errors, slam_accuracy
 from omnibench.words import plural
 
 _FRAMES = 240  # frames drawn of a run (chosen: steps of the slider that can be told apart)
