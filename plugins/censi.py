@@ -52,8 +52,8 @@ from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
+from omnibench.fit.article_methods import TwoWheelMethod
 from omnibench.fit.calibrator import Solution
-from omnibench.fit.differential import TwoWheelMethod
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Mount, Robot, relative

@@ -41,8 +41,8 @@ from pydantic import Field
 
 from omnibench.data.dataset import Trajectory
 from omnibench.errors import NotApplicableError
+from omnibench.fit.article_methods import TwoWheelMethod, axle_length, with_axle
 from omnibench.fit.calibrator import Solution
-from omnibench.fit.differential import TwoWheelMethod, axle_length, with_axle
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array, Robot

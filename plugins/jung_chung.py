@@ -45,7 +45,7 @@ from __future__ import annotations
 
 import math
 
-from omnibench.fit.differential import SquaresMethod
+from omnibench.fit.article_methods import SquaresMethod
 from omnibench.registry import calibrators
 
 

@@ -7,7 +7,6 @@ runs that were not fitted, by the verdict of ``calibrate``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Set
-from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, Literal
@@ -18,19 +17,7 @@ from omnibench.check import faults
 from omnibench.check.evidence import Evidence
 from omnibench.check.misreadings import UNRELATED
 from omnibench.check.motions import lacking
-from omnibench.check.references import early_references, odd_references, unrelated_references
-from omnibench.check.source import (
-    RecordingSource,
-    command,
-    mended_options,
-    odd_times,
-    of_dataset,
-    other_quantities,
-    other_times,
-    read_source,
-    sensible,
-    with_fixes,
-)
+from omnibench.check.source import RecordingSource, odd_times, of_dataset, other_times, read_source, sensible
 from omnibench.config import Model
 from omnibench.data.clock_matching import ClockMatch
 from omnibench.data.dataset import Dataset
@@ -99,31 +86,19 @@ def misreadings(evidence: Evidence) -> Iterator[Finding]:
 DETECTORS: tuple[tuple[Callable[[Evidence], Iterator[Finding]], frozenset[str]], ...] = (
     (faults.notes, frozenset()),
     (faults.own_odometry, frozenset()),
-    (early_references, frozenset()),
+    (faults.early_references, frozenset()),
     (faults.wheel_faults, frozenset()),
     (faults.reference_faults, frozenset()),
     (faults.dead_sensors, SPOILED),
     (misreadings, UNREAD),
-    (odd_references, UNREAD),
-    (unrelated_references, UNREAD | MISREAD | {"wheel_dropout", "reference_dropout"}),
+    (faults.odd_references, UNREAD),
+    (faults.unrelated_references, UNREAD | MISREAD | {"wheel_dropout", "reference_dropout"}),
     (faults.jumps, UNREAD | MISREAD),
     (faults.steering_zero, UNREAD | MISREAD),
     (faults.clocks, UNREAD | {"reference_jump"}),
     (faults.copied_runs, frozenset()),
     (lacking, frozenset()),
 )
-
-
-def findings_in(evidence: Evidence) -> list[Finding]:
-    """The findings of all detectors, those that read the recording first, each of its kind and place once."""
-    read, findings = evidence.read.findings, list[Finding]()
-    for find, hidden_by in DETECTORS:
-        if not hidden_by & {each.kind for each in findings if each.severity == "error" and each not in read}:
-            findings += find(evidence)
-    distinct: dict[tuple[str, str], Finding] = {}
-    for finding in (*read, *findings):
-        distinct.setdefault((finding.kind, finding.where), finding)
-    return sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
 
 
 @computable
@@ -146,19 +121,31 @@ def check(
 
 
 def check_recording(read: RecordingSource) -> CheckReport:
-    """The check of a recording that was read."""
+    """The check of a recording that was read.
+
+    Where mistakes explain its motion that options mend, other findings are looked for in what was meant.
+    """
     evidence = Evidence(read)
     if not read.findings and (otherwise := _read_otherwise(evidence)) is not None:
         return check_recording(otherwise)
-    if not read.findings and (mended := _mended(evidence)) is not None:
-        return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
-    as_read = findings_in(evidence)
-    findings = with_fixes(read, as_read)
+    found = list[Finding]()
+    for find, hidden_by in DETECTORS:
+        if hidden_by & {finding.kind for finding in found if finding.severity == "error"}:
+            continue
+        findings = [*find(evidence)]
+        by_options = find is misreadings and not read.findings and any(finding.changes for finding in findings)
+        if by_options and (mended := read.mended(findings)) is not None:
+            return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
+        found += [finding for finding in findings if finding not in read.findings]
+    # Each finding of its kind and place once, those of the reading first.
+    distinct: dict[tuple[str, str], Finding] = {}
+    for finding in (*read.findings, *found):
+        distinct.setdefault((finding.kind, finding.where), finding)
+    ordered = sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
+    findings = read.with_fixes(ordered)
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
-    misread = MISREAD & {
-        finding.kind for finding in as_read if finding.severity == "error" and finding not in read.findings
-    }
+    misread = MISREAD & {each.kind for each in ordered if each.severity == "error" and each not in read.findings}
     unknown = misread or kinds & (SPOILED | {"reference_foreign", "wheel_unsigned"})
     needed, gain = (None, "") if unknown else expected_gain(read.dataset, kinds)
     typed = [finding for finding in errors if finding.changes]
@@ -181,7 +168,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
         findings=tuple(findings),
         sentence=sentence,
         gain=gain,
-        command=command(read, typed),
+        command=read.command(typed),
         clocks=tuple(evidence.clocks),
     )
 
@@ -197,25 +184,14 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
     if not odd:
         if evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED:
             return None
-        if any(True for detector in (faults.dead_sensors, faults.own_odometry) for _ in detector(evidence)):
+        if [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
             return None
-    quantities: list[list[Finding]] = [[], *([finding] for finding in other_quantities(read))]
+    quantities: list[list[Finding]] = [[], *([finding] for finding in read.other_quantities())]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:
-        if findings and (other := read.read_by(mended_options(read, findings))) is not None and sensible(other):
-            return replace(read, dataset=other, findings=tuple(findings))
+        if findings and (other := read.mended(findings)) is not None and sensible(other.dataset):
+            return other
     return None
-
-
-def _mended(evidence: Evidence) -> RecordingSource | None:
-    """The recording without the mistakes that explain its motion, so that others are looked for in what was meant."""
-    read, hiding = evidence.read, (faults.own_odometry, early_references, faults.reference_faults, faults.dead_sensors)
-    hidden = [finding for detector in hiding for finding in detector(evidence) if finding.severity == "error"]
-    mistakes = [] if UNREAD & {finding.kind for finding in hidden} else [*misreadings(evidence)]
-    if not any(finding.changes for finding in mistakes):
-        return None
-    mended = read.read_by(mended_options(read, mistakes))
-    return None if mended is None else replace(read, dataset=mended, findings=tuple(mistakes))
 
 
 def expected_gain(dataset: Dataset, errors: Set[str] = frozenset()) -> tuple[bool | None, str]:

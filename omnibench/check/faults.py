@@ -14,14 +14,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from omnibench.check.evidence import Evidence
-from omnibench.check.hypotheses import another_zero, wheels_in_words
-from omnibench.check.streams import SAME, looks_of, pose_period
+from omnibench.check.evidence import SAME, Evidence, looks_of, pose_period
+from omnibench.check.hypotheses import POSITION_UNITS, another_zero, wheels_in_words
 from omnibench.data.dataset import Trajectory
 from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
+from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
 from omnibench.data.spoiled_references import follows_the_wheels, reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
-from omnibench.robot.kinematics import CarDrive
+from omnibench.robot.kinematics import Array, CarDrive
+from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
 _MOST_NOTES = 3  # notes on restarts of counters that are shown one by one; chosen
@@ -56,6 +57,17 @@ _USUAL = 500
 _ROWS, _CHANGES, _SHARED = 12, 8, 0.3
 _MOST_KEYS = 500_000  # stretches of poses that are kept, some 50 MB; of more every second, or third... (chosen)
 _DIGIT = 1e-7  # m, to which positions are compared; below the noise of any reference
+_REACHED = 0.05  # share of a run's time after which its last pose comes at least; chosen
+# Share of the squares of the whole runs' turns that the best matrix does not explain: at most 0.005 on OptiOdom's
+# recordings, and 0.68 to 1.45 where the poses of each run were given to one of another command.
+_FOREIGN = 0.25
+_TURNED = 0.5  # rad, root mean square of the runs' turns: less of it tells nothing; chosen
+_FEWEST_RUNS = 3  # runs whose turns a matrix of a few numbers cannot all follow; chosen
+# How many times too large references in another unit are, and that unit; and the option that says so.
+_FACTORS = {"m": POSITION_UNITS, "rad": ((float(np.degrees(1)), "deg"),)}
+_OPTIONS: dict[str, Kind] = {"m": "position_unit", "rad": "heading_unit"}
+_NEAR = 1.5  # a ratio to the odometry within this factor of a unit's is that unit; chosen: designs are off by less
+_LEAST = {"m": 0.02, "rad": 0.05}  # m, rad: motions that are smaller tell nothing of a unit; chosen
 
 
 def runs_in_words(runs: Sequence[str], every: int) -> str:
@@ -173,11 +185,10 @@ def _dead_wheels(evidence: Evidence) -> Iterator[Finding]:
         elif dead.any() and windows is not None:
             lost = windows.unexplained(windows.only(~dead[windows.run]).fit(robot.reach), robot.reach, len(looks))
             if (dead := dead & (lost > np.maximum(_UNEXPLAINED, _UNUSUAL * np.median(lost)))).any():
-                runs = [look.run for look, is_dead in zip(looks, dead.tolist(), strict=True) if is_dead]
+                runs = [looks[number].run for number in np.flatnonzero(dead).tolist()]
                 at = runs_in_words(runs, len(looks))
-                yield error(
-                    "wheel_dead", f"{where} never turns in {at}, {why}", f"{where} in {at}", {"leave_out": runs}
-                )
+                what = f"{where} never turns in {at}, {why}"
+                yield error("wheel_dead", what, f"{where} in {at}", {"leave_out": runs})
 
 
 def _frozen_steering(evidence: Evidence) -> Iterator[Finding]:
@@ -217,16 +228,18 @@ def _unsigned_counts(evidence: Evidence) -> Iterator[Finding]:
     moved = windows.moved * np.exp(-0.5j * windows.turned)
     expected = np.column_stack([moved.real, moved.imag, windows.turned]) @ robot.signal_equations.T
     usual = 0.1 * np.abs(expected).max(axis=0)
-    back = (expected < -usual) & (np.abs(windows.driven) > 0)
-    single = []
-    for index, counts in enumerate(windows.driven.T):
-        falls = min((counts < 0).mean(), (counts > 0).mean())
-        both = min(back[:, index].mean(), (expected[:, index] > usual[index]).mean())
-        if falls < _HARDLY and both > _BOTH and np.corrcoef(np.abs(expected[:, index]), np.abs(counts))[0, 1] > _ALIKE:
-            single.append(index)
+    back = (expected < -usual) & (windows.driven != 0)
+    turned = np.abs(windows.driven)
+    falls = np.minimum((windows.driven < 0).mean(axis=0), (windows.driven > 0).mean(axis=0))
+    both = np.minimum(back.mean(axis=0), (expected > usual).mean(axis=0))
+    single = [
+        index
+        for index in np.flatnonzero((falls < _HARDLY) & (both > _BOTH)).tolist()
+        if np.corrcoef(np.abs(expected[:, index]), turned[:, index])[0, 1] > _ALIKE
+    ]
     if single:
         reversing = np.bincount(windows.run, back[:, single].any(axis=1), len(runs))
-        names = [run.id for run, count in zip(runs, reversing.tolist(), strict=True) if count > 1]
+        names = [runs[number].id for number in np.flatnonzero(reversing > 1).tolist()]
         where = wheels_in_words([robot.wheel_names[index] for index in single])
         what = f"the counts of {where} never fall, though the reference shows that the robot reverses: do its encoders "
         what += "have one channel, which counts up whichever way a wheel turns?"
@@ -269,22 +282,19 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
         if abs(gone) > max(_LEAST_OFF, quantile * clock.drift_error * clock.length):
             drift[run.id] = gone
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (("clock_offset", offset), ("clock_drift", drift))
-    for kind, found in kinds:
-        if not found:
+    for kind, off in kinds:
+        if not off:
             continue
-        least, most = min(found.values()), max(found.values())
-        size = max(-least, most)
-        every = len(found) == count
-        among = "every run" if every else f"{len(found)} of {count} runs"
+        least, most, every = min(off.values()), max(off.values()), len(off) == count
+        size, among = max(-least, most), "every run" if every else f"{len(off)} of {count} runs"
         if kind == "clock_offset":
-            ways = [f"{off:.2f} s too {way}" for way, off in (("late", -least), ("early", most)) if off > 0]
-            off = " to ".join(ways) if len(ways) > 1 else f"up to {ways[0]}"
-            what = f"the stamps of the reference are {off} in {among}"
+            ways = [f"{seconds:.2f} s too {way}" for way, seconds in (("late", -least), ("early", most)) if seconds > 0]
+            what = f"the stamps of the reference are {'up to ' if len(ways) < 2 else ''}{' to '.join(ways)} in {among}"
         else:
-            way = "slow" if size == most else "fast"
-            what = f"the reference's clock goes too {way}, by up to {size:.2f} s a run, in {among}"
+            what = f"the reference's clock goes too {'slow' if size == most else 'fast'}, by up to {size:.2f} s a run"
+            what += f", in {among}"
         severity: Severity = "error" if size > _SPOILS else "warning"
-        where = "the reference" if every else runs_in_words(list(found), count)
+        where = "the reference" if every else runs_in_words(list(off), count)
         yield Finding(kind=kind, what=what, where=where, severity=severity, changes={"clocks": "match"})
 
 
@@ -297,7 +307,7 @@ def copied_runs(evidence: Evidence) -> Iterator[Finding]:
     for run in runs:
         digests = _digests(run)
         keys = set(digests[digests % every == 0].tolist())
-        shared = [seen[key] for key in keys if key in seen]
+        shared = [seen[key] for key in keys & seen.keys()]
         if keys and len(shared) > _SHARED * len(keys):
             copies[run.id] = max(set(shared), key=shared.count)
         else:
@@ -318,3 +328,77 @@ def _digests(run: Trajectory) -> NDArray[np.uint64]:
     changes = np.append(0, np.cumsum(np.any(np.diff(rounded, axis=0) != 0, axis=1)))
     often = changes[_ROWS - 1 :] - changes[: len(stretches)] >= _CHANGES
     return pl.from_numpy(stretches[often]).hash_rows().to_numpy()
+
+
+def odd_references(evidence: Evidence) -> Iterator[Finding]:
+    """Kinds of references whose values are as large as in another unit; beside poses no option mends them alone."""
+    ratios: dict[ReferenceKind, list[float]] = {kind: [] for kind in KINDS}
+    model = OdometryModel.of_design(evidence.dataset.robot, "arc")
+    for run in evidence.dataset.trajectories:
+        if run.references is None or not len(run.references):
+            continue
+        sizes, driven = _sizes(model, run, run.references)
+        for kind, size, expected in zip(run.references.kinds.tolist(), sizes, driven, strict=True):
+            if expected > _LEAST[UNITS[kind]] and np.isfinite(size):
+                ratios[kind].append(size / expected)
+    for kind, values in ratios.items():
+        ratio, must = float(np.median(values)) if values else 0.0, UNITS[kind]
+        for factor, unit in _FACTORS[must]:
+            if factor / _NEAR < ratio < factor * _NEAR:
+                what = f"references of kind {kind} are {ratio:.3g} times what the wheels say, as if they were in "
+                what += f"{'degrees' if unit == 'deg' else unit}: they must be in {must}"
+                where, option = f"references of kind {kind}", _OPTIONS[must]
+                fix = "write these references in m and rad, as the poses are, and import again" if evidence.runs else ""
+                yield error(option, what, where, {} if evidence.runs else {option: unit}, fix=fix)
+
+
+def _sizes(model: OdometryModel, run: Trajectory, references: References) -> tuple[Array, Array]:
+    """Magnitudes (R,) of what was measured and of the same by a model; positions and compass headings since the first.
+
+    NaN for the first of those.
+    """
+    stamps, places = np.unique([references.t0, references.t1], return_inverse=True)
+    log = run.log(stamps)
+    first, last = model.poses([log])[0][places.reshape(2, -1)]  # (R, 3), poses at the begin and at the end of each
+    begin, end = model.lengths([log])[0][places.reshape(2, -1)]
+    values = references.values.copy()
+    for kind in ("position", "heading"):
+        chosen = references.fixed_frame & (references.kinds == kind)
+        if chosen.any():
+            values[chosen] -= values[chosen][0]
+            values[np.flatnonzero(chosen)[0]] = np.nan
+            first[chosen] = last[chosen][0]
+    size = np.where(references.planar, np.hypot(values[:, 0], values[:, 1]), np.abs(values[:, 0]))
+    moved = last - first
+    kinds = [references.kinds == "distance", references.planar]
+    expected = np.select(kinds, [end - begin, np.hypot(moved[:, 0], moved[:, 1])], np.abs(moved[:, 2]))
+    return size, expected
+
+
+def early_references(evidence: Evidence) -> Iterator[Finding]:
+    """The finding that the poses of most runs end long before their wheels."""
+    runs = evidence.aligned
+    early = [run for run in runs if run.references is None and run.pose_times[-1] < _REACHED * run.times[-1]]
+    if 2 * len(early) > len(runs):
+        what = f"the poses of {plural(len(early), 'run')} end long before the wheels, as after "
+        what += f"{early[0].pose_times[-1]:.2g} s of {early[0].times[-1]:.3g} s"
+        fix = "say the unit of the poses' times (pose_time_unit), or record poses to the end of each run"
+        yield error("reference_foreign", what, "the reference", fix=fix)
+
+
+def unrelated_references(evidence: Evidence) -> Iterator[Finding]:
+    """The finding that no matrix explains how the reference turns, as where poses are of other drives.
+
+    It is judged by the share of the squares of the runs' turns that the best matrix does not explain.
+    """
+    windows, fit = evidence.windows, evidence.fit
+    if windows is None or fit is None or len(evidence.runs) < _FEWEST_RUNS:
+        return
+    turned = np.bincount(windows.run, windows.turned)
+    missed = turned - np.bincount(windows.run, windows.driven @ fit.matrix[2])
+    if np.sqrt(np.mean(turned**2)) < _TURNED:
+        return
+    if (share := float((missed**2).sum() / (turned**2).sum())) > _FOREIGN:
+        what = f"the wheels explain {max(0.0, 1 - share):.0%} of how the reference turns"
+        fix = "see whether wheels and poses of each run are of the same drive, and name the robot's wheels right"
+        yield error("reference_foreign", what, "the reference", fix=fix)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 from operator import itemgetter
@@ -148,17 +149,17 @@ def wheel_hypotheses(robot: Robot, *, counted: bool = False) -> Iterator[Hypothe
     Radii of the robot's file are among them, which scale the rates. counted: True if rates were made of ticks.
     """
     yield (plain := plain_hypothesis(robot))
-    for reading, cost, mistake in (*_misread_wheels(robot), *_other_radii(robot, counted)):
+    for reading, cost, mistake in (*_misread_rates(robot, counted), *_misread_angles(robot)):
         if (columns := reading.columns(robot.drive)) is not None:
             yield replace(plain, columns=columns, cost=cost, mistakes=(mistake,))
         elif cost <= _WHEEL:  # each is a fit
             yield replace(plain, cost=cost, mistakes=(mistake,), reading=reading)
 
 
-def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
-    """Each mistake of wheels: the reading that was meant, the cost of the mistake, and the finding that mends it."""
-    drive, names = robot.drive, robot.wheel_names
-    for order, signs in _arrangements(len(names), orders=drive.direct):
+def _misread_rates(robot: Robot, counted: bool) -> Iterator[tuple[Reading, float, Finding]]:
+    """Each mistake of rates or radii: the reading that was meant, the cost of the mistake, and the finding."""
+    names, groups = robot.wheel_names, _groups(len(robot.wheel_names))
+    for order, signs in _arrangements(len(names), orders=robot.drive.direct):
         moved, negative = sum(wheel != column for wheel, column in enumerate(order)), sum(sign < 0 for sign in signs)
         # Positions alone do not tell ahead from back: of readings alike to them those that keep it come first.
         cost = _WHEEL * (moved / 2 + (1.05 if negative == len(signs) else negative))
@@ -166,9 +167,20 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
     for unit, factor in RATE_UNITS.items():
         words = f"wheel rates look like {'turns a second' if unit == 'rev/s' else unit}; omega_* must be rad/s"
         yield Reading((), 1 / factor), _WHEEL, error("wheel_unit", words, "all wheels", {"wheel_unit": unit})
-    for group in _groups(len(names)):
+    for group in groups:
         for factor, cost in [*((count, _WHEEL) for count in _COUNTS), *((float(gear), _FITTED) for gear in _GEARS)]:
             yield Reading((), np.where(group > 0, 1 / factor, 1.0)), cost, _scaled(names, group, factor)
+    # A diameter given as the radius, and other factors.
+    diameter = _WHEEL + (_LIKELIER if counted else -_LIKELIER)
+    yield Reading((), 1 / _DIAMETER), diameter, _radius(robot, groups[0], _DIAMETER)
+    for group in groups:
+        for factor in _RADII.tolist():
+            yield Reading((), np.where(group > 0, 1 / factor, 1.0)), _FITTED, _radius(robot, group, factor)
+
+
+def _misread_angles(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
+    """Each mistake of steering angles, perhaps with the rates of their wheels."""
+    drive, names = robot.drive, robot.wheel_names
     for pair in combinations(range(len(drive.steered)), 2):
         yield _exchanged_angles(drive, *pair)
     if drive.direct or isinstance(drive, CarDrive):
@@ -188,15 +200,6 @@ def _misread_wheels(robot: Robot) -> Iterator[tuple[Reading, float, Finding]]:
             words = f"wheels {names[first]} and {names[second]} look swapped, rates and steering angles"
             both = error("wheels_swapped", words, rates.where, {**rates.changes, **angles.changes})
             yield replace(reading, rate_order=order), _WHEEL, both
-
-
-def _other_radii(robot: Robot, counted: bool) -> Iterator[tuple[Reading, float, Finding]]:
-    """Radii of the robot's file that are off by a factor: a diameter given as the radius, of all wheels and of each."""
-    every, *single = _groups(len(robot.measured))
-    yield Reading((), 1 / _DIAMETER), _WHEEL + (_LIKELIER if counted else -_LIKELIER), _radius(robot, every, _DIAMETER)
-    for group in (every, *single):
-        for factor in _RADII.tolist():
-            yield Reading((), np.where(group > 0, 1 / factor, 1.0)), _FITTED, _radius(robot, group, factor)
 
 
 def _arrangements(count: int, *, orders: bool) -> list[tuple[Sequence[int], Sequence[int]]]:
@@ -254,10 +257,8 @@ def turned_reference(robot: Robot, fit: FreeFit, columns: Array) -> Hypothesis |
     if abs(angle) < _LEAST_TURNED:
         return None
     degrees = round(math.degrees(angle), 1)
-    words = (
-        f"the reference's heading is constantly {abs(degrees):g} degrees too {'small' if degrees > 0 else 'large'}: "
-        "the tracked point is turned on the robot"
-    )
+    words = f"the reference's heading is constantly {abs(degrees):g} degrees too {'small' if degrees > 0 else 'large'}"
+    words += ": the tracked point is turned on the robot"
     if not _has_fixed_wheels(robot):
         words += f", or the wheels' angles in robot.yaml are turned by {-degrees:g} degrees"
     turned = error("reference_turned", words, _REFERENCED, {"heading_offset_deg": degrees})
@@ -281,9 +282,8 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
         if any(np.allclose(other.inverse_kinematic_matrix, design) for design in designs):
             continue
         designs.append(other.inverse_kinematic_matrix)
-        shown, size = (1 / factor, "large") if factor < 1 else (factor, "small")
         cause = next((words for near, words in _CAUSES.items() if abs(factor / near - 1) < _NEAR_CAUSE), "")
-        words = f"the {place} of the wheels in robot.yaml look about {_rounded(shown)} times too {size}{cause}"
+        words = f"the {place} of the wheels in robot.yaml look about {_times_too(1 / factor, 'large', 'small')}{cause}"
         # A factor of one steered axle may be one of its angles as well.
         cost = _REFERENCE if cause and (robot.drive.direct or len(robot.drive.steered) > 2) else _FITTED
         yield wrong("design_distance", words, {"wheels": _placed(robot, keys, factor)}, other, cost)
@@ -321,13 +321,10 @@ def _placed(robot: Robot, keys: Sequence[str], factor: float) -> dict[str, dict[
 
 def _corrected(robot: Robot, wheels: Mapping[str, Mapping[str, Any]]) -> Robot | None:
     """The robot with other values of some wheels; None if nothing changes, or it is no robot."""
-    if not wheels:
-        return None
-    try:
-        other = corrected_robot(robot, wheels, None)
-        return other if np.isfinite(other.inverse_kinematic_matrix).all() else None
-    except (ConfigError, np.linalg.LinAlgError):
-        return None
+    with suppress(ConfigError, np.linalg.LinAlgError):
+        if wheels and np.isfinite((other := corrected_robot(robot, wheels, None)).inverse_kinematic_matrix).all():
+            return other
+    return None
 
 
 def _tracked_point(robot: Robot, fit: FreeFit) -> Array:
@@ -424,22 +421,18 @@ def _named_steering(robot: Robot, group: Array, reading: Reading) -> Iterator[Hy
     zero = math.degrees(float(np.broadcast_to(reading.offsets, len(steered))[chosen]))
     wrong, cost = list[Finding](), 0.0
     if 1 / _ALIKE < factor / DEGREE < _ALIKE:
-        words = "steering angles look like degrees; steer_* must be rad"
-        changes: dict[str, Any] = {"steering_unit": "deg"}
-        if not every:
-            words = f"the steering angle of {names} looks like degrees"
-            changes = {"steering_factors": np.where(group > 0, DEGREE, 1.0).tolist()}
+        factors = np.where(group > 0, DEGREE, 1.0).tolist()
+        changes: dict[str, Any] = {"steering_unit": "deg"} if every else {"steering_factors": factors}
+        words = f"the steering angle of {names} looks like degrees; it must be rad"
         wrong, cost = [error("steering_unit", words, where, changes)], _WHEEL
     elif 1 / _ALIKE < -factor < _ALIKE:
         wrong, cost = [_clockwise(steered, group)], _WHEEL
     elif not 1 / _LEAST_GEAR < factor < _LEAST_GEAR:
-        size, count = abs(factor), 2 * math.pi / abs(factor)
-        words = (
-            f"steering angles look about {_rounded(max(size, 1 / size))} times too {'large' if size < 1 else 'small'}"
-        )
+        size = abs(factor)
         command = f": is it a command, 1 for {size:.2g} rad, or is there a gear between encoder and wheel?"
-        words += _as_ticks(count) if count > FEWEST_TICKS else command
-        factors = [float(f"{size:.3g}") if member else 1.0 for member in group]
+        words = f"steering angles look about {_times_too(1 / size, 'large', 'small')}"
+        words += _as_ticks(2 * math.pi / size) or command
+        factors = np.where(group > 0, float(f"{size:.3g}"), 1.0).tolist()
         wrong = [error("steering_unit", words, where, {"steering_factors": factors[:1] if every else factors})]
         wrong += [_clockwise(steered, group)] if factor < 0 else []
         cost = _REFERENCE
@@ -460,10 +453,8 @@ def _arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int
     changes: dict[str, Any] = {"wheel_order": list(order)} if moved else {}
     changes |= {"wheel_signs": list(signs)} if negative else {}
     if moved:
-        shown = ", ".join(
-            f"{name} <- {'-' if sign < 0 else ''}{names[column]}"
-            for name, column, sign in zip(names, order, signs, strict=True)
-        )
+        columns = zip(names, order, signs, strict=True)
+        shown = ", ".join(f"{name} <- {'-' if sign < 0 else ''}{names[column]}" for name, column, sign in columns)
         flipped = " and sign-flipped" if negative else ""
         words = f"wheels look swapped{flipped}; the reference fits with omega of {shown}"
         return error("wheels_swapped", words, wheels_in_words(moved), changes)
@@ -476,32 +467,31 @@ def _arrangement(names: Sequence[str], order: Sequence[int], signs: Sequence[int
 def _scaled(names: Sequence[str], group: Array, factor: float) -> Finding:
     """The wheels of a group (N,) of 0 and 1 whose rates are a factor too high."""
     where = "all wheels" if group.all() else _members(names, group)
-    size, shown = ("high", factor) if factor > 1 else ("low", 1 / factor)
-    words = f"the rates of {where} look about {_rounded(shown)} times too {size}"
-    ticks = 2 * math.pi * factor
+    words = f"the rates of {where} look about {_times_too(factor, 'high', 'low')}"
     if factor in _COUNTS:
-        words += f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of "
-        words += f"{shown:g}"
+        shown = max(factor, 1 / factor)
+        words += (
+            f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of {shown:g}"
+        )
     else:
-        words += _as_ticks(ticks) if ticks > FEWEST_TICKS else "; is there a gear between the encoder and the wheel?"
-    factors = [float(f"{factor:.3g}") if member else 1.0 for member in group]
+        words += _as_ticks(2 * math.pi * factor) or "; is there a gear between the encoder and the wheel?"
+    factors = np.where(group > 0, float(f"{factor:.3g}"), 1.0).tolist()
     return error("wheel_scale", words, where, {"rate_factors": factors})
 
 
 def _radius(robot: Robot, group: Array, factor: float) -> Finding:
     """The wheels of a group (N,) of 0 and 1 whose radius in the robot's file is a factor too large."""
-    members = [wheel for wheel, member in zip(robot.measured, group.tolist(), strict=True) if member]
-    size, shown = ("large", factor) if factor > 1 else ("small", 1 / factor)
-    of_what = "all wheels" if group.all() else wheels_in_words([wheel.name for wheel in members])
-    words = f"the radius of {of_what} in robot.yaml looks about {_rounded(shown)} times too {size}"
+    where = "all wheels" if group.all() else _members(robot.wheel_names, group)
+    words = f"the radius of {where} in robot.yaml looks about {_times_too(factor, 'large', 'small')}"
     words += ", as where a diameter is given as the radius" if factor == _DIAMETER else ""
+    members = [wheel for wheel, member in zip(robot.measured, group.tolist(), strict=True) if member]
     radii = {wheel.name: {"radius": float(f"{wheel.radius / factor:.4g}")} for wheel in members}
     return error("design_radius", words, "robot.yaml", {"wheels": radii})
 
 
 def _clockwise(steered: Sequence[str], group: Array) -> Finding:
     """Steering angles of a group (S,) of 0 and 1 that count clockwise."""
-    names, signs = _members(steered, group), [-1 if member else 1 for member in group.tolist()]
+    names, signs = _members(steered, group), np.where(group > 0, -1, 1).tolist()
     words = f"the steering angle of {names} looks counted clockwise; it must count counter-clockwise"
     return error("steering_sign", words, f"steering of {names}", {"steering_signs": signs})
 
@@ -513,7 +503,7 @@ def another_zero(robot: Robot, group: Array, degrees: float) -> Finding:
     words += "its zero not straight ahead"
     if group.all() and not _has_fixed_wheels(robot):
         words += f"; or the reference is turned: heading_offset_deg={degrees:g}"
-    changes = {"steering_offsets_deg": [degrees if member else 0.0 for member in group.tolist()]}
+    changes = {"steering_offsets_deg": np.where(group > 0, degrees, 0.0).tolist()}
     return error("steering_zero", words, f"steering of {names}", changes)
 
 
@@ -541,7 +531,13 @@ def _has_fixed_wheels(robot: Robot) -> bool:
 
 
 def _as_ticks(count: float) -> str:
-    return f", as ticks would be at about {_rounded(count)} a turn of the wheel"
+    """So many ticks a turn as a likely cause of a factor; empty if they are too few for an encoder."""
+    return f", as ticks would be at about {_rounded(count)} a turn of the wheel" if count > FEWEST_TICKS else ""
+
+
+def _times_too(factor: float, above: str, below: str) -> str:
+    """``2.5 times too high``: a factor, above or below 1, in words."""
+    return f"{_rounded(max(factor, 1 / factor))} times too {above if factor > 1 else below}"
 
 
 def _rounded(value: float) -> str:

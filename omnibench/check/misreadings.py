@@ -19,21 +19,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.check.hypotheses import (
-    IN_DEGREES,
-    Hypothesis,
-    Reading,
-    another_mount,
-    design_hypotheses,
-    mirrored_positions,
-    plain_hypothesis,
-    position_units,
-    reference_hypotheses,
-    steering_readings,
-    steering_scales,
-    turned_reference,
-    wheel_hypotheses,
-)
+from omnibench.check import hypotheses as readings
+from omnibench.check.hypotheses import Hypothesis, Reading
 from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows, continuous, transformed, usual_changes
 from omnibench.data.finding import Finding
 from omnibench.robot.kinematics import Array, CarDrive, Robot, wrapped
@@ -218,7 +205,7 @@ def _other_kinds(best: Sequence[Finding], others: Sequence[tuple[Finding, ...]])
 def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     """The scores of all hypotheses, without those of fits whose residual alone is beyond any explanation."""
     weight, best = min(fit.windows / _CORRELATED, _MOST_WEIGHED), math.inf
-    every = list(wheel_hypotheses(recording.robot, counted=recording.counted))
+    every = list(readings.wheel_hypotheses(recording.robot, counted=recording.counted))
     transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
     for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
         residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.unexplained.min())
@@ -247,19 +234,19 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
         yield robot, wheels
         if base.exclusive:
             return
-        for unit in position_units():
+        for unit in readings.position_units():
             yield robot, [wheel.with_reference(unit) for wheel in simple]
         turned = [
             wheel.with_reference(reference)
             for wheel in simple
             if not wheel.mistakes or wheel.mistakes[0].kind != "wheels_swapped"
-            if (reference := turned_reference(robot, base.fit, wheel.columns)) is not None
+            if (reference := readings.turned_reference(robot, base.fit, wheel.columns)) is not None
         ]
         if turned:
             yield robot, turned
-        for hypothesis in () if base.mistakes else design_hypotheses(robot, base.fit):
+        for hypothesis in () if base.mistakes else readings.design_hypotheses(robot, base.fit):
             yield hypothesis.robot or robot, [hypothesis]
-    for mirrored in reference_hypotheses(base.flipped):
+    for mirrored in readings.reference_hypotheses(base.flipped):
         yield robot, [wheel.with_reference(mirrored) for wheel in simple]
 
 
@@ -274,11 +261,11 @@ def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> I
     read_as: list[tuple[Recorded, tuple[Finding, ...], float]] = [(recording, (), 0.0)]
     for factor in (1.0, -1.0):
         if (base := degrees.with_headings(factor).fit()) is not None:
-            yield _Base(base, (IN_DEGREES,), cost, flipped=factor < 0)
+            yield _Base(base, (readings.IN_DEGREES,), cost, flipped=factor < 0)
             if factor > 0 and (beyond or base.unexplained[1] < fit.unexplained[1] / 2):
-                read_as.append((degrees, (IN_DEGREES,), cost))
+                read_as.append((degrees, (readings.IN_DEGREES,), cost))
     for read, mistakes, more in read_as:
-        for hypothesis in (*wheels, *steering_readings(read.robot, read.logs, read.poses)):
+        for hypothesis in (*wheels, *readings.steering_readings(read.robot, read.logs, read.poses)):
             if (base := read.meant(hypothesis).fit()) is not None:
                 yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, exclusive=True)
 
@@ -288,19 +275,19 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not any(log.rates.any() for log in recording.logs):
         return Explained()
     positions, robot, moments = recording.without_headings, recording.robot, _Moments.of(recording)
-    plain = plain_hypothesis(robot)
+    plain = readings.plain_hypothesis(robot)
     present = float(moments.misfits([plain])[0])
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         contradicting = _contradicting(recording)
         return moments.off_centre() if positions and not contradicting else Explained(contradicting)
     hypotheses = list(_sparse_hypotheses(recording))
     if positions:
-        hypotheses.append(plain.with_reference(mirrored_positions()))
+        hypotheses.append(plain.with_reference(readings.mirrored_positions()))
     scored = []
-    for radian, headings in ((1.0, ()), (math.pi / 180, (IN_DEGREES,)))[: 1 if positions else 2]:
+    for radian, headings in ((1.0, ()), (math.pi / 180, (readings.IN_DEGREES,)))[: 1 if positions else 2]:
         for hypothesis, misfit in zip(hypotheses, moments.misfits(hypotheses, radian).tolist(), strict=True):
             scored.append((misfit, hypothesis.cost, (*headings, *hypothesis.mistakes)))
-    for hypothesis in steering_scales(robot):
+    for hypothesis in readings.steering_scales(robot):
         misfits = _Moments.of(recording.meant(hypothesis)).misfits([plain])
         scored.append((float(misfits[0]), hypothesis.cost, hypothesis.mistakes))
     if present <= _MISFIT and not positions:  # another design misses by as much: only steering is judged
@@ -325,12 +312,9 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     present = far.contradictions(gram, np.eye(len(gram))[None])[0]
     if present <= _CONTRADICTING / 3:
         return ()
-    steering = [
-        hypothesis
-        for hypothesis in wheel_hypotheses(recording.robot)
-        if hypothesis.reading is None
-        and any(key.startswith("steering") for mistake in hypothesis.mistakes for key in mistake.changes)
-    ]
+    linear = [hypothesis for hypothesis in readings.wheel_hypotheses(recording.robot) if hypothesis.reading is None]
+    keys = [[key for mistake in hypothesis.mistakes for key in mistake.changes] for hypothesis in linear]
+    steering = [each for each, changed in zip(linear, keys, strict=True) if "steering" in " ".join(changed)]
     shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
     best = int(shares.argmin())
     return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
@@ -343,13 +327,13 @@ def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
     design.
     """
     wheels = []
-    for wheel in wheel_hypotheses(recording.robot, counted=recording.counted):
+    for wheel in readings.wheel_hypotheses(recording.robot, counted=recording.counted):
         scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
         small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
         if wheel.reading is None and not small:
             wheels.append(wheel)
     yield from wheels
-    for unit in position_units():
+    for unit in readings.position_units():
         for wheel in wheels:
             if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit":
                 yield wheel.with_reference(unit)
@@ -359,16 +343,13 @@ def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
 class _Moments:
     """Some runs, at moments between which the robot turns by a radian: path since the start, turn since the last one.
 
-    odometry: of the logs at these moments. path (S,): complex, m. turns (S,): rad. first (S,): True for the first
-    moment of a run.
+    odometry: of the logs at these moments. poses, starts (S, 3): of the reference, there and at the begin of the run.
     """
 
-    robot: Robot
+    recording: Recorded
     odometry: OdometryBatch
     poses: Array
     starts: Array
-    first: NDArray[np.bool_]
-    without_headings: bool = False
 
     @classmethod
     def of(cls, recording: Recorded) -> _Moments:
@@ -388,25 +369,28 @@ class _Moments:
             poses.append(np.vstack([of_run[:1], of_run[seen]]))
         odometry = OdometryBatch(logs, "arc")
         starts = np.array([of_run[0] for of_run in poses])[odometry.trajectory]
-        first = np.diff(odometry.trajectory, prepend=-1) > 0
-        moved = np.concatenate([of_run[1:] for of_run in poses])
-        return cls(recording.robot, odometry, moved, starts, first, recording.without_headings)
+        return cls(recording, odometry, np.concatenate([of_run[1:] for of_run in poses]), starts)
+
+    @property
+    def first(self) -> NDArray[np.bool_]:
+        """True (S,) for the first moment of a run."""
+        return np.diff(self.odometry.trajectory, prepend=-1) > 0
 
     def misfits(self, hypotheses: Sequence[Hypothesis], radian: float = 1.0) -> Array:
         """Misfits (P,) of the design to the poses under hypotheses, from 0 (exact) to 1 (unrelated).
 
         radian: unit of the recorded headings. NaN where the robot hardly moved: at rest it fits any matrix.
         """
-        design, columns = self.robot.inverse_kinematic_matrix, np.array([each.columns for each in hypotheses])
-        odometry = self.odometry.poses(design @ np.linalg.inv(columns))
+        robot, columns = self.recording.robot, np.array([each.columns for each in hypotheses])
+        odometry = self.odometry.poses(robot.inverse_kinematic_matrix @ np.linalg.inv(columns))
         metres = np.array([each.rows[0, 0] for each in hypotheses])[:, None]
         moved = self.poses - self.starts
         path = metres * (moved[:, 0] + 1j * moved[:, 1]) * np.exp(-1j * radian * self.starts[:, 2])
         driven = odometry[..., 0] + 1j * odometry[..., 1]
-        if self.without_headings:
+        firsts, run = np.flatnonzero(self.first), self.odometry.trajectory
+        if self.recording.without_headings:
             # From the first position of each run, which is turned to fit; and seen in a mirror.
             path = np.where([[np.linalg.det(each.rows[:2, :2]) < 0] for each in hypotheses], path.conj(), path)
-            firsts, run = np.flatnonzero(self.first), np.cumsum(self.first) - 1
             driven = driven - driven[:, firsts][:, run]
             path = path * np.exp(1j * np.angle(np.add.reduceat(driven * path.conj(), firsts, axis=1)))[:, run]
         turned = self._turns(odometry[..., 2])
@@ -416,13 +400,13 @@ class _Moments:
         by_wheels = np.minimum(np.abs(turned), _TURN)
         angles = (by_wheels + np.minimum(np.abs(turned - missed), _TURN)).sum(axis=1)
         # Noise and slip may amount to a radian and the robot's size at every moment, and to more while it turns.
-        count, rims, size = len(moved), by_wheels.sum(axis=1), self.robot.reach
+        count, rims, size = len(moved), by_wheels.sum(axis=1), robot.reach
         position = np.abs(driven - path).sum(axis=1) / (lengths + size * (rims + count))
         heading = np.abs(missed).sum(axis=1) / (angles + count)
-        runs = int(self.first.sum())
-        if self.without_headings:
-            return np.where(lengths < runs * size, np.nan, position)
-        return np.where((lengths < runs * size) & (angles < runs), np.nan, np.maximum(position, heading))
+        at_rest = lengths < len(firsts) * size
+        if self.recording.without_headings:
+            return np.where(at_rest, np.nan, position)
+        return np.where(at_rest & (angles < len(firsts)), np.nan, np.maximum(position, heading))
 
     def off_centre(self) -> Explained:
         """The mistake of a tracked point off the centre, by positions in frames that each run may have turned.
@@ -430,7 +414,8 @@ class _Moments:
         Runs of one motion tell how far the point is ahead, or behind, but not which: such points are named alike. None
         is where the point is near or not known, or where the design fits about as well without it.
         """
-        reach, count = self.robot.reach, len(usual_changes(self.robot))
+        robot = self.recording.robot
+        reach, count = robot.reach, len(usual_changes(robot))
         exact, nothing = _EXACT * reach, np.zeros(count + 2)
         starts = [np.append(nothing[:count], np.multiply(signs, reach / 2)) for signs in product((1, -1), repeat=2)]
         deviation = max(self._missed(nothing), exact)
@@ -442,16 +427,16 @@ class _Moments:
         values, cost, error = max(likely, key=lambda point: float(point[0][count]))  # trackers mostly stand ahead
         without, dearer, _ = self._fitted(nothing, deviation, count)
         close = max(self._missed(values), exact) < _REMAINS * self._missed(without)
-        mistake = another_mount(self.robot, values[count:])
+        mistake = readings.another_mount(robot, values[count:])
         if mistake is None or not close or dearer - cost < _FITTED_POINT or error > np.hypot(*values[count:]) / 2:
             return Explained()
         distinct, alike = [values[count:]], list[tuple[Finding, ...]]()
         for point in (other[count:] for other, _, _ in likely):
-            if min(np.hypot(*(point - other)) for other in distinct) > _APART * reach:
-                distinct.append(point)
-                if (other := another_mount(self.robot, point)) is not None:
-                    words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
-                    alike.append((other.model_copy(update={"what": words}),))
+            apart = min(np.hypot(*(point - other)) for other in distinct) > _APART * reach
+            distinct += [point] if apart else []
+            if apart and (other := readings.another_mount(robot, point)) is not None:
+                words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
+                alike.append((other.model_copy(update={"what": words}),))
         return Explained((mistake,), tuple(alike))
 
     def _fitted(self, start: Array, deviation: float, free: int) -> tuple[Array, float, float]:
@@ -462,7 +447,7 @@ class _Moments:
         from scipy.optimize import least_squares  # slow to import
 
         count, as_one = len(start) - 2, max(_CORRELATED, len(self.poses) / _MOST_WEIGHED)
-        steps = 1e-4 * np.append(np.ones(count), [self.robot.reach] * 2)[:free]
+        steps = 1e-4 * np.append(np.ones(count), [self.recording.robot.reach] * 2)[:free]
 
         def residuals(values: Array) -> Array:
             """Residuals (P, 2 S + J) of values (P, free), in standard deviations."""
@@ -491,13 +476,13 @@ class _Moments:
 
         values (P, J + 2): changes of the design in standard deviations, and x and y of the tracked point, m.
         """
-        changes = np.tensordot(values[:, :-2], usual_changes(self.robot), 1)
-        poses = self.odometry.poses(self.robot.inverse_kinematic_matrix + changes)
+        robot, run = self.recording.robot, self.odometry.trajectory
+        changes = np.tensordot(values[:, :-2], usual_changes(robot), 1)
+        poses = self.odometry.poses(robot.inverse_kinematic_matrix + changes)
         point = (values[:, -2] + 1j * values[:, -1])[:, None]
-        firsts, run = np.flatnonzero(self.first), np.cumsum(self.first) - 1
+        firsts, counts = np.flatnonzero(self.first), np.bincount(run)
         places = [poses[..., 0] + 1j * poses[..., 1] + point * np.exp(1j * poses[..., 2])]
         places.append((self.poses[:, 0] + 1j * self.poses[:, 1])[None])
-        counts = np.bincount(run)
         driven, seen = (place - (np.add.reduceat(place, firsts, axis=1) / counts)[:, run] for place in places)
         angles = np.angle(np.add.reduceat(driven * seen.conj(), firsts, axis=1))
         off: Complex = driven - seen * np.exp(1j * angles)[:, run]

@@ -193,14 +193,8 @@ def _of_run(run: int, log: WheelLog, poses: Array, length: float) -> Windows | N
     bent: Complex = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
     path = poses[:, 0] + 1j * poses[:, 1]
     moved: Complex = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
-    return Windows(
-        at[:, -1] - at[:, 0],
-        bent,
-        poses[last, 2] - poses[first, 2],
-        moved,
-        np.full(len(first), run),
-        np.column_stack([begins, ends]),
-    )
+    turned, runs, times = poses[last, 2] - poses[first, 2], np.full(len(first), run), np.column_stack([begins, ends])
+    return Windows(at[:, -1] - at[:, 0], bent, turned, moved, runs, times)
 
 
 def _robust(columns: Complex, observed: Complex) -> tuple[Complex, Array]:
@@ -263,15 +257,16 @@ class DesignDistance:
     def __init__(self, robot: Robot) -> None:
         self.design = robot.inverse_kinematic_matrix
         scales, columns = robot.row_scales, self.design.shape[1]
-        self._outside = _beyond_twists(robot)
+        # The projection (M, M) that takes from drive signals those that a twist of the robot gives.
+        within, strengths, _ = np.linalg.svd(robot.signal_equations @ robot.allowed_basis, full_matrices=False)
+        within = within[:, strengths > 1e-9 * strengths[0]]
+        outside = np.eye(columns) - within @ within.T
+        self._outside = np.where(np.abs(outside) < 1e-12, 0.0, outside)
         self._units = np.repeat(1 / scales, columns)
         # S (3M, 3M) in units of the rows: what radii, gains, and yaw and place of the tracked point may change.
-        turn = self.design[2]
-        places = [
-            _PLACE * robot.reach * np.array(rows) for rows in ([turn, 0 * turn, 0 * turn], [0 * turn, turn, 0 * turn])
-        ]
-        changes = [*usual_changes(robot), *places]
-        flat = np.array(changes).reshape(len(changes), -1)
+        turn, still = self.design[2], 0 * self.design[2]
+        places = _PLACE * robot.reach * np.array([[turn, still, still], [still, turn, still]])
+        flat = np.concatenate([usual_changes(robot), places]).reshape(-1, 3 * columns)
         allowed = flat.T @ flat + np.diag(np.repeat((_ELEMENT * scales) ** 2, columns))
         self._allowed = allowed * np.outer(self._units, self._units)
 
@@ -302,15 +297,6 @@ class DesignDistance:
         outside = np.einsum("ij,pjk,ik->p", self._outside, grams, self._outside)
         shares: Array = np.sqrt(np.maximum(outside, 0.0) / whole)
         return shares
-
-
-def _beyond_twists(robot: Robot) -> Array:
-    """The projection (M, M) that takes from drive signals those that a twist of the robot gives."""
-    equations = robot.signal_equations @ robot.allowed_basis
-    within, strengths, _ = np.linalg.svd(equations, full_matrices=False)
-    within = within[:, strengths > 1e-9 * strengths[0]]
-    outside: Array = np.eye(len(equations)) - within @ within.T
-    return np.where(np.abs(outside) < 1e-12, 0.0, outside)
 
 
 def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array]:

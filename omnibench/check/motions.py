@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.check.evidence import Evidence
-from omnibench.check.references import left_open
 from omnibench.data.finding import Finding, Kind
 from omnibench.data.stored import drawn_runs
 from omnibench.fit.evaluate import command_names
+from omnibench.fit.open_combinations import open_sentences
 from omnibench.fit.span import driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.words import plural
@@ -81,6 +81,17 @@ def lacking(evidence: Evidence) -> Iterator[Finding]:
     if max(Counter(command_names(runs)).values()) < _LEAST_REPEATED:
         what = "no command was driven twice: noise and errors of the model cannot be told apart"
         yield _warning("few_repetitions", what, "drive every command three times")
+
+
+def left_open(evidence: Evidence) -> Iterator[Finding]:
+    """Findings on what the training runs leave open: with no reference of turning, or none of lengths, a warning."""
+    training = evidence.dataset.split("train")
+    for number, sentence in enumerate(open_sentences(evidence.dataset.robot, training) if training else ()):
+        what, _, fix = sentence.rpartition("; " if "; " in sentence else ": ")
+        missing = what.startswith(("no reference tells of turning", "no reference tells of lengths"))
+        kind: Kind = "motion_missing" if missing else "references_leave_open"
+        where = f"the recording, {number + 1}" if number else "the recording"
+        yield Finding(kind=kind, what=what, where=where, severity="warning" if missing else "note", fix=fix)
 
 
 def _warning(kind: Kind, what: str, fix: str) -> Finding:

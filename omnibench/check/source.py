@@ -90,6 +90,75 @@ class RecordingSource:
         except (DataError, ConfigError):
             return None
 
+    def other_quantities(self) -> Iterator[Finding]:
+        """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
+        if self.reading is None or not (quantities := {each.wheels.unit for each in self.reading[0]}):
+            return
+        present = min(quantities)
+        unit = present.partition("/")[0]
+        names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
+        for ending, quantity in names.items():
+            if unit != "rpm" and (other := f"{unit}{ending}") != present:
+                what = f"the wheels look like {quantity} ({other}); read as {quantity_of(present)} ({present})"
+                yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
+
+    def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
+        """The recording as these findings mend it, which it then has; None if it cannot be read so."""
+        dataset = self.read_by(self.mended_options(findings))
+        return None if dataset is None else replace(self, dataset=dataset, findings=tuple(findings))
+
+    def mended_options(self, findings: Sequence[Finding]) -> dict[str, Any]:
+        """The options with the changes of findings, which are relative to those by which the recording was read."""
+        options = dict(self.options)
+        for key, value in (change for finding in findings for change in finding.changes.items()):
+            options |= _changed(self, options, key, value)
+            if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
+                lists = [options.get(option) or () for other in _COLUMNS.values() for option in other]
+                listed = {str(name) for names in lists for name in names}
+                options["columns"] = {k: name for k, name in options["columns"].items() if str(name) not in listed}
+                options = {k: v for k, v in options.items() if k != "columns" or v}
+        return options
+
+    def settings(self, findings: Sequence[Finding]) -> list[str]:
+        """The options, KEY=VALUE, by which findings are mended, beside those by which the recording was read."""
+        mended = self.mended_options(findings)
+        return [f"{key}={as_yaml(value)}" for key, value in mended.items() if self.options.get(key) != value]
+
+    def with_fixes(self, findings: Sequence[Finding]) -> list[Finding]:
+        """The findings, each with the options that mend it where they are not set already."""
+        fixed = []
+        for finding in findings:
+            typed = self.settings([finding]) if finding.changes else []
+            fixed.append(finding.model_copy(update={"fix": " --set ".join(typed)}) if typed else finding)
+        return fixed
+
+    def command(self, findings: Sequence[Finding]) -> str:
+        """The command line that reads it again, mended; of a data set in memory it says that it is to be saved."""
+        if not self.settings(findings):
+            return ""
+        if self.places:
+            return f'for each in {in_few_words(self.places)}; do omnibench check "$each"; done'
+        saved = "" if self.readable else f"  # after save_dataset(dataset, {str(self.source)!r})"
+        return self.import_command(self.mended_options(findings)) + saved
+
+    def next_command(self) -> str:
+        """The command line that goes on where nothing is to be mended: calibrate a data set, or first import a log."""
+        places = self.places or ([self.folder] if self.folder and (self.folder / "dataset.yaml").is_file() else [])
+        if places:
+            return f"omnibench calibrate {in_few_words(places)} -o calibration.yaml"
+        return self.import_command(self.options)
+
+    def import_command(self, options: Mapping[str, Any]) -> str:
+        """The command line that imports the source by some options."""
+        if self.folder is None:
+            target = Path("data") / (_title(self.source) or "recording")
+        else:
+            target = self.folder.with_name(f"{self.folder.name}_mended") if self.importer == "dataset" else self.folder
+        words = ["omnibench", "import", self.importer, str(self.source), "-o", str(target), "--force"]
+        for key, value in options.items():
+            words += ["--set", f"{key}={as_yaml(value)}"]
+        return shlex.join(words)
+
 
 def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
     """The runs of a data set as recordings."""
@@ -171,9 +240,10 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
             dataset = _read(name, source, {**options, "fastest": _ANY_RATE})
         except (DataError, ConfigError):
             raise refusal from None
-    if dataset.referenced:
-        return dataset
-    raise DataError(f"{source}: it has no reference poses; import it, which makes them from its scans, and check that")
+    if not dataset.referenced:
+        lacking = "it has no reference poses; import it, which makes them from its scans, and check that"
+        raise DataError(f"{source}: {lacking}")
+    return dataset
 
 
 def _title(source: Path) -> str:
@@ -224,65 +294,6 @@ def other_times(given: Mapping[str, Any]) -> Iterator[Finding]:
             yield error("time_unit", f"{which} look like {unit}; they are read in s", where, changes)
 
 
-def with_fixes(read: RecordingSource, findings: Sequence[Finding]) -> list[Finding]:
-    """The findings, each with the options that mend it where they are not set already."""
-    fixed = []
-    for finding in findings:
-        if finding.changes and (settings := settings_of(read, [finding])):
-            finding = finding.model_copy(update={"fix": " --set ".join(settings)})
-        fixed.append(finding)
-    return fixed
-
-
-def settings_of(read: RecordingSource, findings: Sequence[Finding]) -> list[str]:
-    """The options, KEY=VALUE, by which findings are mended, beside those by which the recording was read."""
-    mended = mended_options(read, findings)
-    return [f"{key}={as_yaml(value)}" for key, value in mended.items() if read.options.get(key) != value]
-
-
-def command(read: RecordingSource, findings: Sequence[Finding]) -> str:
-    """The command line that reads a recording again, mended; of a data set in memory it says that it is to be saved."""
-    if not settings_of(read, findings):
-        return ""
-    if read.places:
-        return f'for each in {in_few_words(read.places)}; do omnibench check "$each"; done'
-    saved = "" if read.readable else f"  # after save_dataset(dataset, {str(read.source)!r})"
-    return import_command(read, mended_options(read, findings)) + saved
-
-
-def next_command(read: RecordingSource) -> str:
-    """The command line that goes on where nothing is to be mended: a data set is calibrated, a log imported first."""
-    places = read.places or ([read.folder] if read.folder and (read.folder / "dataset.yaml").is_file() else [])
-    if places:
-        return f"omnibench calibrate {in_few_words(places)} -o calibration.yaml"
-    return import_command(read, read.options)
-
-
-def import_command(read: RecordingSource, options: Mapping[str, Any]) -> str:
-    """The command line that imports a source by some options."""
-    if read.folder is None:
-        target = Path("data") / (_title(read.source) or "recording")
-    else:
-        target = read.folder.with_name(f"{read.folder.name}_mended") if read.importer == "dataset" else read.folder
-    words = ["omnibench", "import", read.importer, str(read.source), "-o", str(target), "--force"]
-    for key, value in options.items():
-        words += ["--set", f"{key}={as_yaml(value)}"]
-    return shlex.join(words)
-
-
-def mended_options(read: RecordingSource, findings: Sequence[Finding]) -> dict[str, Any]:
-    """The options with the changes of findings, which are relative to those by which the recording was read."""
-    options = dict(read.options)
-    for key, value in (change for finding in findings for change in finding.changes.items()):
-        options |= _changed(read, options, key, value)
-        if key in _COLUMNS and options.get("columns"):  # names that now stand in the lists
-            lists = [options.get(option) or () for other in _COLUMNS.values() for option in other]
-            listed = {str(name) for names in lists for name in names}
-            options["columns"] = {k: name for k, name in options["columns"].items() if str(name) not in listed}
-            options = {k: v for k, v in options.items() if k != "columns" or v}
-    return options
-
-
 def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """The options that one change sets, relative to the present ones."""
     present = options.get(key)
@@ -292,12 +303,11 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
         case "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
             turned = round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)
             return {"pose_signs": _product(options.get("pose_signs"), [1, -1, 1]), "heading_offset_deg": turned}
-        case "wheel_signs" | "pose_signs":
-            return {key: _product(present, value)}
-        case "steering_signs":  # offsets are added after the signs
-            offsets = options.get("steering_offsets_deg")
-            turned_back = {"steering_offsets_deg": _product(offsets, value)} if offsets else {}
-            return {key: _product(present, value), **turned_back}
+        case "wheel_signs" | "pose_signs" | "steering_signs":
+            changed: dict[str, Any] = {key: _product(present, value)}
+            if key == "steering_signs" and (offsets := options.get("steering_offsets_deg")):
+                changed["steering_offsets_deg"] = _product(offsets, value)  # they are added after the signs
+            return changed
         case "steering_factors":
             return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
         case "steering_offsets_deg":
@@ -349,19 +359,6 @@ def _geared(read: RecordingSource, options: Mapping[str, Any], factors: Sequence
 
 def _unit_of_wheels(read: RecordingSource, options: Mapping[str, Any]) -> str:
     return str(options.get("wheel_unit") or (read.reading[0][0].wheels.unit if read.reading else "rad/s"))
-
-
-def other_quantities(read: RecordingSource) -> Iterator[Finding]:
-    """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
-    if read.reading is None or not (quantities := {each.wheels.unit for each in read.reading[0]}):
-        return
-    present = sorted(quantities)[0]
-    unit = present.partition("/")[0]
-    names = {"": "positions", "/sample": "increments since the row before", "/s": "rates"}
-    for ending, quantity in names.items():
-        if unit != "rpm" and (other := f"{unit}{ending}") != present:
-            what = f"the wheels look like {quantity} ({other}); read as {quantity_of(present)} ({present})"
-            yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
 
 
 def _listed(present: Any, count: int, default: float) -> list[float]:

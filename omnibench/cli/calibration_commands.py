@@ -4,12 +4,13 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 import omnibench
 from omnibench.cli import options as shared
+from omnibench.cli.options import argument, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -25,39 +26,29 @@ calibration_app = typer.Typer()
 
 
 @calibration_app.command()
+@shared.grouped
 def compare(
-    config: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="CONFIG|DATASET",
-            help="Comparison config (YAML), or a data set (its folder, several, a glob) for a quick comparison.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        shared.output_option("Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."),
-    ] = None,
-    data: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--data",
-            metavar="[NAME=]PATH",
-            help="Where the recordings of the config's data set NAME are on this disk; of a study, the folder of all.",
-        ),
-    ] = None,
-    backend: shared.BackendName = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes, or Dask workers started here. Default: the config's.")
-    ] = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: Annotated[
-        list[Path] | None,
-        typer.Option("--plugins", metavar="DIR", help="Folder of plug-ins besides the config's; may be repeated."),
-    ] = None,
+    config: list[Path] = argument(
+        "Comparison config (YAML), or a data set (its folder, several, a glob) for a quick comparison.",
+        ...,
+        metavar="CONFIG|DATASET",
+    ),
+    output: Path | None = output_option(
+        "Folder for the results; finished runs in it are kept. Default: results/NAME/TIME."
+    ),
+    data: list[str] | None = option(
+        "Where the recordings of the config's data set NAME are on this disk; of a study, the folder of all.",
+        "--data",
+        metavar="[NAME=]PATH",
+    ),
+    jobs: shared.BackendOptions = shared.BackendOptions(
+        workers=option("Processes, or Dask workers started here. Default: the config's.", min=1)
+    ),
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = option(
+        "Folder of plug-ins besides the config's; may be repeated.", "--plugins", metavar="DIR"
+    ),
 ) -> None:
     """Run calibrators on equal terms, score them, write a report.
 
@@ -67,22 +58,25 @@ def compare(
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.compare.report.comparison_report import comparison_document
+    from omnibench.study.config import StudyConfig
     from omnibench.study.study import is_study, read_study_config
 
     shared.refuse_figures_without_browser(figures)
     asked = shared.plugin_folders(plugins or [])
-    given = {"backend": backend, "workers": workers, "tls": shared.tls_files(tls_ca, tls_cert, tls_key)}
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {"backend": jobs.backend, "workers": jobs.workers, "tls": jobs.tls}
+    chosen: CompareConfig | StudyConfig
     if len(config) == 1 and config[0].is_file() and is_study(config[0]):
-        study = read_study_config(config[0], _named_paths(data))
-        folders = [*study.plugins, *(folder.resolve() for folder in asked)]
-        study = study.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
-        return _run_study(study, output, figures, force)
-    comparison = _asked_comparison(config, data, asked)
-    folders = [*comparison.plugins, *(folder.resolve() for folder in asked)]
-    comparison = comparison.model_copy(update={"plugins": tuple(dict.fromkeys(folders))} | given)
+        chosen = read_study_config(config[0], _named_paths(data))
+    else:
+        chosen = _asked_comparison(config, data, asked)
+    folders = tuple(dict.fromkeys([*chosen.plugins, *(folder.resolve() for folder in asked)]))
+    chosen = chosen.model_copy(
+        update={"plugins": folders} | {name: value for name, value in given.items() if value is not None}
+    )
+    if isinstance(chosen, StudyConfig):
+        return _run_study(chosen, output, figures, force)
     with ProgressDisplay() as watch:
-        result = omnibench.run_comparison(comparison, output, watch, force=force)
+        result = omnibench.run_comparison(chosen, output, watch, force=force)
         if figures is not None:
             watch(Progress("drawing the figures"))
             shared.write_asked_figures(comparison_document(result), figures)
@@ -157,26 +151,19 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
 
 
 @calibration_app.command(cls=shared.FitCommand)
+@shared.grouped
 def calibrate(
     context: typer.Context,
-    dataset: shared.DatasetFolders,
-    output: Annotated[
-        Path | None, shared.output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml")
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
-    ] = None,
-    figures: shared.Figures = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    settings: shared.Settings = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    dataset: list[Path] = shared.DATASETS,
+    output: Path | None = output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml"),
+    page: shared.ReportOptions = shared.report_options(
+        "Write a page: before and after, paths, parameters, errors by motion."
+    ),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
+    settings: list[str] | None = shared.SETTINGS,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Fit a robot's odometry model; write it with -o.
 
@@ -189,15 +176,10 @@ def calibrate(
     shared.load_given_plugins(plugins)
     chosen = shared.chosen_settings(context, parse_settings(settings))
     refuse_existing(output, force=force)
-    shared.refuse_report(report, figures, force=force)
-    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ()
-    with (
-        redirect_stdout(sys.stderr),
-        ProgressDisplay() as watch,
-        shared.asked_backend(backend, workers, tls, preload, watch) as jobs,
-    ):
+    page.refuse(force=force)
+    with redirect_stdout(sys.stderr), ProgressDisplay() as watch, jobs.opened(watch) as backend:
         recordings = omnibench.load_dataset(dataset)
-        run = omnibench.calibrate(recordings, chosen, watch=watch, backend=jobs)
+        run = omnibench.calibrate(recordings, chosen, watch=watch, backend=backend)
     calibration, result = run.calibration, run.result
     if output is not None:
         write_text(output, to_yaml(calibration))
@@ -212,17 +194,13 @@ def calibrate(
     assert calibration.provenance is not None  # a fit has one, with its verdict
     assert calibration.provenance.held_out is not None
     verdict = calibration.provenance.held_out
-    shared.write_asked_report(
-        lambda: calibration_document(calibration, recordings, verdict, run.warnings), report, figures, announced=True
-    )
+    page.write(lambda: calibration_document(calibration, recordings, verdict, run.warnings), announced=True)
     if as_json:
         return print_json(calibration)
     file = [] if output is None else [f"calibration: {output}"]
-    ending = [
-        "whether it is better, and what to do next, in a line that is longer than many terminals are wide",
-        "COMMAND",
-    ]
-    room = print_calibration(make_console(), run, [*warnings, *file, verdict.sentence, *ending], verdict.detail)
+    # The last sentence takes a line that is longer than many terminals are wide, and the command one more.
+    printed = [*warnings, *file, verdict.sentence, 96 * ".", "COMMAND"]
+    room = print_calibration(make_console(), run, printed, verdict.detail)
     for line in file:
         typer.echo(line)
     print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
@@ -236,34 +214,25 @@ def calibrate(
 
 
 @calibration_app.command()
+@shared.grouped
 def evaluate(
-    calibration: shared.CalibrationFile,
-    dataset: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
-    ] = None,
-    paths: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--path",
-            metavar="PATH",
-            help='Path to predict errors for: "straight 1.0" (m), "turn 360" (deg), "circle 1.0 left" (its radius), '
-            '"square 1.0 right" (its side); may be repeated.',
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Write a page: before and after, paths, parameters, errors by motion."),
-    ] = None,
-    figures: shared.Figures = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    calibration: Path = shared.CALIBRATION,
+    dataset: list[Path] | None = argument(
+        "Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."
+    ),
+    paths: list[str] | None = option(
+        'Path to predict errors for: "straight 1.0" (m), "turn 360" (deg), "circle 1.0 left" (its radius), '
+        '"square 1.0 right" (its side); may be repeated.',
+        "--path",
+        metavar="PATH",
+    ),
+    page: shared.ReportOptions = shared.report_options(
+        "Write a page: before and after, paths, parameters, errors by motion."
+    ),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Show a calibration's errors on a data set, and those on paths.
 
@@ -275,11 +244,10 @@ def evaluate(
     from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
-    shared.refuse_report(report, figures, force=force)
-    if not dataset and (report or figures):
+    page.refuse(force=force)
+    if not dataset and page.asked:
         raise ConfigError("--report and --figures show recordings: name a data set, too")
-    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
+    with ProgressDisplay() as watch, jobs.opened(watch):
         evaluated = omnibench.read_calibration(calibration)
         predicted = predicted_errors(evaluated, paths or ())
         recordings = omnibench.load_dataset(dataset) if dataset else None
@@ -290,7 +258,7 @@ def evaluate(
     warn(warnings)
     if recordings is not None and evaluation is not None:
         of_data = recordings, evaluation.held_out, evaluation.warnings
-        shared.write_asked_report(lambda: calibration_document(evaluated, *of_data), report, figures, announced=True)
+        page.write(lambda: calibration_document(evaluated, *of_data), announced=True)
     if as_json:
         document = {} if evaluation is None else evaluation.model_dump()
         return print_json(document | {"paths": [error.model_dump() for error in predicted], "warnings": warnings})
@@ -305,29 +273,19 @@ def evaluate(
 
 
 @calibration_app.command()
+@shared.grouped
 def certify(
-    calibration: shared.CalibrationFile,
-    dataset: shared.DatasetFolders,
-    box: Annotated[
-        Literal["paper", "row"] | None,
-        typer.Option(help="Matrices to compare with; see calibrate. Default: the box of the calibration's search."),
-    ] = None,
-    gap: Annotated[
-        float, typer.Option(min=1e-9, max=0.999, help="Stop once at most this share of the cost could be saved.")
-    ] = 1e-3,
-    seconds: Annotated[
-        float, typer.Option(min=0.0, help="Stop after this time, in s; the bound proven by then holds.")
-    ] = 60.0,
-    parts: Annotated[
-        int | None, typer.Option(min=1, help="Stop after so many parts of the box: a limit that no machine changes.")
-    ] = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    calibration: Path = shared.CALIBRATION,
+    dataset: list[Path] = shared.DATASETS,
+    box: Literal["paper", "row"] | None = option(
+        "Matrices to compare with; see calibrate. Default: the box of the calibration's search."
+    ),
+    gap: float = option("Stop once at most this share of the cost could be saved.", default=1e-3, min=1e-9, max=0.999),
+    seconds: float = option("Stop after this time, in s; the bound proven by then holds.", default=60.0, min=0.0),
+    parts: int | None = option("Stop after so many parts of the box: a limit that no machine changes.", min=1),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Prove how far a calibration's cost is from the lowest possible.
 
@@ -336,19 +294,12 @@ def certify(
     from omnibench.cli.terminal.calibration_tables import print_certificate, print_certificate_ending
 
     shared.load_given_plugins(plugins)
-    tls, preload = shared.tls_files(tls_ca, tls_cert, tls_key), ("omnibench.fit.certify",)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, preload, watch) as jobs:
+    with ProgressDisplay() as watch, jobs.opened(watch, "omnibench.fit.certify") as backend:
         recordings = omnibench.load_dataset(dataset)
         certified = omnibench.certify_optimum(
-            omnibench.read_calibration(calibration),
-            recordings,
-            box=box,
-            gap=gap,
-            seconds=seconds,
-            parts=parts,
-            watch=watch,
-            backend=jobs,
-        )
+            omnibench.read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, parts=parts,
+            watch=watch, backend=backend,
+        )  # fmt: skip
     warn(recordings.warnings)
     if not certified.inside:
         warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])
@@ -360,15 +311,11 @@ def certify(
 
 @calibration_app.command()
 def export(
-    calibration: shared.CalibrationFile,
-    to: Annotated[
-        str, typer.Option("--to", metavar="FORMAT", help="ros2_controllers, robot_localization or c_header.")
-    ],
-    output: Annotated[
-        Path | None, shared.output_option("File or folder to write to. Default: standard output.")
-    ] = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
+    calibration: Path = shared.CALIBRATION,
+    to: str = option("ros2_controllers, robot_localization or c_header.", "--to", default=..., metavar="FORMAT"),
+    output: Path | None = output_option("File or folder to write to. Default: standard output."),
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Convert a calibration for ROS 2 or C programs.
 
@@ -392,24 +339,20 @@ def export(
 
 @calibration_app.command()
 def discover(
-    dataset: shared.DatasetFolder,
-    model: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="CALIBRATION", help="Start from this calibration. Default: fit a matrix."),
-    ] = None,
-    output: Annotated[Path | None, shared.output_option("Folder for the results. Default: results/NAME/TIME.")] = None,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", metavar="NAME", help="Effect not to try; may be repeated.")
-    ] = None,
-    unknown_term: Annotated[
-        bool,
-        typer.Option(help="Where no name is sure, close the gap all the same, by a term without a name."),
-    ] = True,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    dataset: Path = shared.DATASET,
+    model: Path | None = option(
+        "Start from this calibration. Default: fit a matrix.", "--model", metavar="CALIBRATION"
+    ),
+    output: Path | None = output_option("Folder for the results. Default: results/NAME/TIME."),
+    without: list[str] | None = option("Effect not to try; may be repeated.", "--without", metavar="NAME"),
+    unknown_term: bool = option(
+        "Where no name is sure, close the gap all the same, by a term without a name.", default=True
+    ),
+    seed: int = option("Seed of the random numbers.", default=0, min=0),
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Find and name the physics that a robot's model lacks.
 

@@ -32,6 +32,7 @@ from omnibench.registry import importers, load_plugin_file
 from omnibench.slam.import_dataset import import_dataset
 
 GITHUB = "https://github.com"
+NEWEST = "HEAD"  # instead of a commit: the newest one, or of a clone that is there the one checked out
 
 # GitHub's rules for names, and a repository's address where one is pasted.
 _REPOSITORY = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]*/(?!\.{1,2}$)[A-Za-z0-9._][A-Za-z0-9._-]*")
@@ -46,8 +47,8 @@ class PublicDataset(Model):
 
     name: str
     path: str
-    robot: str
-    runs: str
+    robot: str = ""
+    runs: str = ""
     options: dict[str, Any] = {}
 
 
@@ -60,11 +61,11 @@ class PublicRecording(Model):
 
     name: str
     repository: str
-    commit: str
-    licence: str
-    reference: str
+    commit: str = NEWEST
+    licence: str = ""
+    reference: str = ""
     article: str = ""
-    importer: str
+    importer: str = ""
     plugin: str = ""
     datasets: tuple[PublicDataset, ...]
 
@@ -73,53 +74,35 @@ class _Catalogue(Model):
     recordings: tuple[PublicRecording, ...]
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A repository of GitHub, and what of it is wanted.
-
-    recording: None for a repository that the catalogue does not hold; datasets is then empty.
-    """
-
-    repository: str
-    recording: PublicRecording | None = None
-    datasets: tuple[PublicDataset, ...] = ()
-
-
 RECORDINGS = read_model(_Catalogue, Path(__file__).with_name("recordings.yaml")).recordings
 
 
-def address(repository: str) -> str:
-    """The address from which a repository is cloned."""
-    return f"{GITHUB}/{repository}.git"
-
-
-def find_recording(name: str) -> Asked:
+def find_recording(name: str) -> PublicRecording:
     """The recording of a name: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
 
-    ConfigError names the nearest known name and lists all.
+    One that the catalogue does not hold has no importer, and is one data set. ConfigError names the nearest known name
+    and lists all.
     """
-    known: dict[str, Asked] = {}
-    by_repository: dict[str, Asked] = {}
+    known: dict[str, PublicRecording] = {}
+    by_repository: dict[str, PublicRecording] = {}
     for recording in RECORDINGS:
         for dataset in recording.datasets:
-            one = Asked(recording.repository, recording, (dataset,))
+            one = recording.model_copy(update={"datasets": (dataset,)})
             known |= {dataset.name: one, f"{recording.name}/{dataset.name}": one}
-        whole = Asked(recording.repository, recording, recording.datasets)
-        known[recording.name] = by_repository[recording.repository.lower()] = whole
+        known[recording.name] = by_repository[recording.repository.lower()] = recording
     repository = _ADDRESS.sub("", name)
     if (asked := known.get(name) or by_repository.get(repository.lower())) is not None:
         return asked
     owner = repository.partition("/")[0]
     if _REPOSITORY.fullmatch(repository) and owner not in {recording.name for recording in RECORDINGS}:
-        return Asked(repository)
+        whole = PublicDataset(name=repository.partition("/")[2], path=".")
+        return PublicRecording(name=repository, repository=repository, datasets=(whole,))
     short = [each for each in known if "/" not in each]
     raise ConfigError(
         f"fetch: unknown recording {name!r}; {nearest(name, known)}known: {', '.join(sorted(short))}, and any "
         "OWNER/REPO on GitHub"
     )
 
-
-NEWEST = "HEAD"  # instead of a commit: the newest one, or of a clone that is there the one checked out
 
 _PATIENCE = 10.0  # s for git to end after it was told to; chosen
 # A connection on which hardly anything comes for a minute is given up: bytes per s, and s; chosen.
@@ -144,17 +127,8 @@ _CAUSES = (
 )
 
 
-@dataclass(frozen=True)
-class Clone:
-    """A clone in ``folder`` with nothing changed. commit: the one that is checked out, in full."""
-
-    repository: str
-    folder: Path
-    commit: str
-
-
-def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> Clone:
-    """The clone of OWNER/REPO in ``folder`` at a commit; one that is there is used again.
+def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> str:
+    """Clone OWNER/REPO into ``folder`` and check a commit out, whose full name it returns; a clone is used again.
 
     ConfigError or DataError in one line: no such repository or commit, no git, no network, no space, or the folder
     holds something else or a clone that was changed.
@@ -173,19 +147,13 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
             raise ConfigError(f"{folder} is a clone of {remote or 'nothing'}, not of {repository}; {away}")
         if changed := _ask(folder, "status", "--porcelain", "--untracked-files=all").splitlines():
             raise ConfigError(f"{folder}: {changed[0].split(maxsplit=1)[-1]} is not as in the repository; {away}")
-        if (found := _find(folder, commit)) is None:
+        if not _find(folder, commit):
             whole = ("--unshallow",) if _ask(folder, "rev-parse", "--is-shallow-repository") == "true" else ()
             _work(repository, ("fetch", "--progress", *whole, "origin"), folder, report)
-            found = _find(folder, commit)
-        if found != _ask(folder, "rev-parse", NEWEST):
-            _check_out(repository, folder, commit, found, report)
-    else:
-        _make(repository, folder, commit, report)
-    return Clone(repository, folder, _ask(folder, "rev-parse", NEWEST))
-
-
-def _make(repository: str, folder: Path, commit: str, report: Reporter) -> None:
-    """Clone into a folder beside, which is renamed once it is whole; whatever ends this leaves nothing there."""
+        if _find(folder, commit) != _find(folder, NEWEST):
+            _check_out(repository, folder, commit, report)
+        return _find(folder, NEWEST)
+    # It is cloned into a folder beside, which is renamed once it is whole; whatever ends this leaves nothing there.
     check_place(folder)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     made = [parent for parent in folder.parents if not parent.exists()]
@@ -193,9 +161,9 @@ def _make(repository: str, folder: Path, commit: str, report: Reporter) -> None:
     part = ("--depth", "1") if commit == NEWEST else ("--filter=blob:none", "--no-checkout")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        _work(repository, ("clone", "--progress", *part, address(repository), str(partial)), None, report)
+        _work(repository, ("clone", "--progress", *part, f"{GITHUB}/{repository}.git", str(partial)), None, report)
         if commit != NEWEST:
-            _check_out(repository, partial, commit, _find(partial, commit), report)
+            _check_out(repository, partial, commit, report)
         partial.rename(folder)
     except OSError as error:
         raise DataError(f"{folder}: cannot be written: {error.strerror or error}; choose another place") from None
@@ -204,17 +172,18 @@ def _make(repository: str, folder: Path, commit: str, report: Reporter) -> None:
         with suppress(OSError):
             for parent in made:  # they stay unless empty
                 parent.rmdir()
+    return _find(folder, NEWEST)
 
 
-def _check_out(repository: str, folder: Path, commit: str, found: str | None, report: Reporter) -> None:
-    if found is None:
+def _check_out(repository: str, folder: Path, commit: str, report: Reporter) -> None:
+    if not (found := _find(folder, commit)):
         raise ConfigError(f"{repository} has no commit {commit}; --commit {NEWEST} takes the newest")
     _work(repository, ("checkout", "--progress", "--detach", found), folder, report)
 
 
-def _find(folder: Path, commit: str) -> str | None:
-    """The full name of a commit; None if the clone does not hold it."""
-    return _ask(folder, "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}") or None
+def _find(folder: Path, commit: str) -> str:
+    """The full name of a commit; empty if the clone does not hold it."""
+    return _ask(folder, "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}")
 
 
 def _environment() -> dict[str, str]:
@@ -225,16 +194,9 @@ def _environment() -> dict[str, str]:
 
 def _ask(folder: Path, *arguments: str) -> str:
     """Output of a git command in a clone; empty if the command fails."""
-    answer = subprocess.run(
-        ["git", "-C", str(folder), *arguments],
-        env=_environment(),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
-    )
-    return answer.stdout.strip() if answer.returncode == 0 else ""
+    command, silent = ["git", "-C", str(folder), *arguments], subprocess.DEVNULL
+    answer = subprocess.run(command, env=_environment(), stdin=silent, capture_output=True, check=False)
+    return answer.stdout.decode(errors="replace").strip() if answer.returncode == 0 else ""
 
 
 def _work(repository: str, arguments: Sequence[str], folder: Path | None, report: Reporter) -> None:
@@ -242,13 +204,9 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
     command = ["git", *_STALLED, *(() if folder is None else ("-C", str(folder))), *arguments]
     task = f"git {arguments[0]}: {repository}"
     report(Progress(task))
+    silent = subprocess.DEVNULL
     process = subprocess.Popen(
-        command,
-        env=_environment(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
+        command, env=_environment(), stdin=silent, stdout=silent, stderr=subprocess.PIPE, start_new_session=True
     )
     said: list[str] = []
     try:
@@ -257,12 +215,23 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
                 report(Progress(step[1].lower(), int(step[2]), int(step[3]), "object", note=step[4] or ""))
             else:
                 said.append(line)
-        failed = process.wait() != 0
+        process.wait()
     except BaseException:
-        _end(process)
+        # Git ends, and the programs that it has started.
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_PATIENCE)
+                break
         raise
-    if failed:
-        raise _failure(repository, said)
+    if process.returncode:
+        complaints = [line for line in said if line.startswith(("fatal:", "error:", "remote:"))]
+        words = "; ".join(line.partition(":")[2].strip() for line in complaints) or " ".join(said[-1:]) or "it failed"
+        for pattern, meaning in _CAUSES:
+            if re.search(pattern, " ".join(said), re.IGNORECASE):
+                raise DataError(f"{repository}: {meaning} (git: {words})")
+        raise DataError(f"{repository}: git could not clone it: {words}")
     report(Progress(task, result=""))
 
 
@@ -284,26 +253,6 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[str]:
             return
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End git and the programs that it has started."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, number)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_PATIENCE)
-            return
-
-
-def _failure(repository: str, said: Sequence[str]) -> DataError:
-    """Git's failure in one line: what it means, and git's own words."""
-    complaints = [line for line in said if line.startswith(("fatal:", "error:", "remote:"))]
-    words = "; ".join(line.partition(":")[2].strip() for line in complaints) or " ".join(said[-1:]) or "it failed"
-    for pattern, meaning in _CAUSES:
-        if re.search(pattern, " ".join(said), re.IGNORECASE):
-            return DataError(f"{repository}: {meaning} (git: {words})")
-    return DataError(f"{repository}: git could not clone it: {words}")
-
-
 CLONES = Path("clones")  # where clones are kept, as OWNER/REPO
 DATA = Path("data")  # where data sets go, where the user names no folder
 
@@ -315,11 +264,14 @@ _LONGEST = 80  # characters of a licence's title; chosen
 class Fetched:
     """A public recording on this disk.
 
-    cite: the article, or else the repository. licence: as the data sets say it, empty if it is not known. licence_file:
-    its text in the clone. datasets: by their folders. refusal: why nothing was imported; importer: that was tried.
+    folder, commit: of the clone of its repository. cite: the article, or else the repository. licence: as the data sets
+    say it, empty if it is not known. licence_file: its text in the clone. datasets: by their folders. refusal: why
+    nothing was imported; importer: that was tried.
     """
 
-    clone: Clone
+    repository: str
+    folder: Path
+    commit: str
     cite: str
     licence: str
     licence_file: Path | None
@@ -330,7 +282,7 @@ class Fetched:
     @property
     def source(self) -> str:
         """The origin, as the data sets say it."""
-        return f"public GitHub repository {self.clone.repository}, commit {self.clone.commit}"
+        return f"public GitHub repository {self.repository}, commit {self.commit}"
 
 
 def fetch_recording(
@@ -349,77 +301,56 @@ def fetch_recording(
     """
     asked = find_recording(name)
     # The folder that was named, or one below it for each of several data sets.
-    names = [dataset.name for dataset in asked.datasets] or [asked.repository.partition("/")[2]]
-    folders = [(output or DATA) / dataset_name for dataset_name in names]
-    if output is not None and len(names) == 1:
+    folders = [(output or DATA) / dataset.name for dataset in asked.datasets]
+    if output is not None and len(folders) == 1:
         folders = [output]
     for folder in folders:
         check_dataset_folder(folder)
     refuse_existing(*folders, force=force, folders=True)
-    recording = asked.recording
-    default = recording.commit if recording else NEWEST
-    clone = open_clone(asked.repository, CLONES / asked.repository, commit or default, report)
-    if recording is None:
-        # Any other repository has one data set, if its format is recognised; else a refusal says why it has none.
-        folder = folders[0]
-        file = _licence_file(clone.folder)
-        # A licence's title is the first line of its text.
-        text = "" if file is None else file.read_text(encoding="utf-8", errors="replace")
-        title = next((line.strip()[:_LONGEST] for line in text.split("\n") if line.strip()), "")
-        fetched = Fetched(clone, f"{GITHUB}/{clone.repository}", title, file, {})
-        report(Progress("importing"))
-        try:
-            fetched = replace(fetched, importer=recognised(clone.folder))
-            dataset = _imported(fetched, fetched.importer, clone.folder, folder, {})
-            wrong = [mistake.what for mistake in search(recorded(dataset)).mistakes if mistake.kind in UNITS]
-            if wrong:
-                raise DataError("; ".join(wrong))
-        except (ConfigError, DataError) as refused:
-            return replace(fetched, refusal=str(refused))
-        finally:
-            report(Progress("importing", result=""))
-        _save(fetched, dataset, folder, force)
-        return replace(fetched, datasets={folder: dataset})
-    return _import_catalogued(clone, recording, dict(zip(folders, asked.datasets, strict=True)), force, report)
-
-
-def _import_catalogued(
-    clone: Clone, recording: PublicRecording, datasets: Mapping[Path, PublicDataset], force: bool, report: Reporter
-) -> Fetched:
-    """Import data sets of a recording of the catalogue, by its plug-in unless an importer of that name is there."""
-    if recording.plugin and recording.importer not in [entry.name for entry in importers.entries()]:
-        failure = load_plugin_file(bundled_folder() / "plugins" / recording.plugin)
+    place = CLONES / asked.repository
+    commit = open_clone(asked.repository, place, commit or asked.commit, report)
+    # The importer is the catalogue's plug-in, unless one of that name is there.
+    if asked.plugin and asked.importer not in [entry.name for entry in importers.entries()]:
+        failure = load_plugin_file(bundled_folder() / "plugins" / asked.plugin)
         if failure is not None:
             raise PluginError(f"plug-in {failure.origin} cannot be imported: {failure.error}")
-    cite = recording.article or f"{GITHUB}/{clone.repository}"
-    fetched = Fetched(clone, cite, recording.licence, _licence_file(clone.folder), {})
-    imported = {}
-    for folder, dataset in datasets.items():
-        source = clone.folder / dataset.path
+    licence, file = asked.licence, _licence_file(place)
+    if not asked.importer and file is not None:
+        # A licence's title is the first line of its text.
+        text = file.read_text(encoding="utf-8", errors="replace")
+        licence = next((line.strip()[:_LONGEST] for line in text.split("\n") if line.strip()), "")
+    cite = asked.article or f"{GITHUB}/{asked.repository}"
+    fetched = Fetched(asked.repository, place, commit, cite, licence, file, {}, importer=asked.importer)
+    imported = dict[Path, Dataset]()
+    for folder, asked_dataset in zip(folders, asked.datasets, strict=True):
+        task = f"importing {asked_dataset.name}" if asked.importer else "importing"
+        source = place / asked_dataset.path
         if not source.exists():
-            raise DataError(f"{source} is not in commit {clone.commit[:8]}; leave --commit out to take the one tested")
-        report(Progress(f"importing {dataset.name}"))
-        imported[folder] = _imported(fetched, recording.importer, source, folder, dataset.options)
-        _save(fetched, imported[folder], folder, force)
-        report(Progress(f"importing {dataset.name}", result=""))
+            raise DataError(f"{source} is not in commit {commit[:8]}; leave --commit out to take the one tested")
+        report(Progress(task))
+        try:
+            if not asked.importer:
+                fetched = replace(fetched, importer=recognised(source))
+            # The importer's options hold origin and licence where they can, to be kept when it is imported again.
+            origin = {"name": folder.resolve().name, "source": fetched.source, "licence": licence}
+            fields = importers.entry(fetched.importer).options.model_fields
+            given = {key: text for key, text in origin.items() if key in fields and text and text.isprintable()}
+            dataset = import_dataset(fetched.importer, source, {**given, **asked_dataset.options})
+            dataset = replace(dataset, source=fetched.source, licence=licence or dataset.licence)
+            mistakes = () if asked.importer else search(recorded(dataset)).mistakes
+            if wrong := [mistake.what for mistake in mistakes if mistake.kind in UNITS]:
+                raise DataError("; ".join(wrong))
+        except (ConfigError, DataError) as refusal:
+            if asked.importer:
+                raise
+            return replace(fetched, refusal=str(refusal))
+        finally:
+            report(Progress(task, result=""))
+        save_dataset(dataset, folder, overwrite=force)
+        if file is not None:
+            write_files({folder / file.name: file.read_bytes()})
+        imported[folder] = dataset
     return replace(fetched, datasets=imported)
-
-
-def _imported(fetched: Fetched, importer: str, source: Path, folder: Path, options: Mapping[str, Any]) -> Dataset:
-    """A data set that says its origin and licence. The importer's options hold them where they can, to be kept when
-    the recording is imported again."""
-    fields = importers.entry(importer).options.model_fields
-    origin = {"name": folder.resolve().name, "source": fetched.source, "licence": fetched.licence}
-    given = {key: text for key, text in origin.items() if key in fields and text and text.isprintable()}
-    dataset = import_dataset(importer, source, {**given, **options})
-    return replace(dataset, source=fetched.source, licence=fetched.licence or dataset.licence)
-
-
-def _save(fetched: Fetched, dataset: Dataset, folder: Path, force: bool) -> None:
-    """Write a data set with the text of its licence."""
-    save_dataset(dataset, folder, overwrite=force)
-    if fetched.licence_file is not None:
-        write_files({folder / fetched.licence_file.name: fetched.licence_file.read_bytes()})
 
 
 def _licence_file(folder: Path) -> Path | None:

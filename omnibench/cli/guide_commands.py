@@ -3,17 +3,16 @@
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Mapping
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
-from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Json, Plugins, load_given_plugins, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, say
+from omnibench.cli import options as shared
+from omnibench.cli.options import argument, flag, option, output_option
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
 from omnibench.words import plural
@@ -25,14 +24,13 @@ if TYPE_CHECKING:
 guide_app = typer.Typer()
 
 _READING_WIDTH = 100  # columns: longer lines are hard to follow
-_NAME_WIDTH = 15  # columns, of the longest topic
+_NAME_WIDTH = 17  # columns, of the longest topic and two spaces
 _MOST_LISTED = 10  # files of a folder that are written out by name
-_NAMES = _NAME_WIDTH + 4  # columns, with the spaces around it
 
 
 @guide_app.command()
 def guide(
-    topic: Annotated[str | None, typer.Argument(help="What to read about. Default: the list of topics.")] = None,
+    topic: str | None = argument("What to read about. Default: the list of topics."),
 ) -> None:
     """Show the handbook: a topic, or the list of topics."""
     from omnibench.cli.handbook_topics import find_topic, topics
@@ -41,7 +39,7 @@ def guide(
         listed = topics()
         for group in dict.fromkeys(topic.group for topic in listed):
             typer.echo(f"{group}:")
-            _print_names({topic.name: topic.summary for topic in listed if topic.group == group})
+            print_names({topic.name: topic.summary for topic in listed if topic.group == group}, _NAME_WIDTH)
         print_ending("these are the pages of the handbook", "read one", "omnibench", "guide", "getting-started")
     else:
         # As pages on a terminal, as it stands where it is piped.
@@ -61,9 +59,9 @@ def guide(
 
 @guide_app.command()
 def example(
-    name: Annotated[str | None, typer.Argument(help="One of the list that is shown without it.")] = None,
-    output: Annotated[Path | None, output_option("Folder to write to.", metavar="DIR")] = None,
-    force: Force = False,
+    name: str | None = argument("One of the list that is shown without it."),
+    output: Path | None = output_option("Folder to write to.", metavar="DIR"),
+    force: bool = shared.FORCE,
 ) -> None:
     """Write an example to begin with, or list the examples.
 
@@ -72,7 +70,7 @@ def example(
     from omnibench.cli.examples import EXAMPLES, find_example, write_example
 
     if name is None:
-        _print_names({each.name: each.summary for each in EXAMPLES})
+        print_names({each.name: each.summary for each in EXAMPLES}, _NAME_WIDTH)
         print_ending("these are the examples", "write one into a folder", "omnibench", "example", "small", "-o", "demo")
         return None
     chosen = find_example(name)
@@ -99,12 +97,6 @@ def example(
     return print_ending(f"{output} holds the example {name}", "type the lines above")
 
 
-def _print_names(summaries: Mapping[str, str]) -> None:
-    width = make_console().width
-    for name, summary in summaries.items():
-        typer.echo(fill(summary, width, initial_indent=f"  {name:{_NAME_WIDTH}}  ", subsequent_indent=" " * _NAMES))
-
-
 _plugin = typer.Typer(help="Write a new plug-in, or check one.", no_args_is_help=True, rich_markup_mode=None)
 guide_app.add_typer(_plugin, name="plugin")
 
@@ -119,7 +111,7 @@ _CONFIGS = {
 
 
 @guide_app.command("list")
-def list_(plugins: Plugins = None, as_json: Json = False) -> None:
+def list_(plugins: list[Path] | None = shared.PLUGINS, as_json: bool = shared.JSON) -> None:
     """List calibrators, costs, effects and importers.
 
     Each with where it comes from: built in, a plug-in's file, or an installed package.
@@ -128,7 +120,7 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
     from omnibench.registry import REGISTRIES, Entry
     from omnibench.report.blocks import Column, Row, Table
 
-    failures = load_given_plugins(plugins)
+    failures = shared.load_given_plugins(plugins)
     if as_json:
         # All that a config can name, with the JSON schema of its options, and the plug-ins that failed.
         def row(entry: Entry[object]) -> dict[str, object]:
@@ -152,9 +144,9 @@ def list_(plugins: Plugins = None, as_json: Json = False) -> None:
 
 @guide_app.command()
 def schema(
-    kind: Annotated[
-        Literal["compare", "design", "live", "simulate", "study"], typer.Argument(help="Which command's config.")
-    ] = "compare",
+    kind: Literal["compare", "design", "live", "simulate", "study"] = argument(
+        "Which command's config.", default="compare"
+    ),
 ) -> None:
     """Print the JSON schema of a config, for editors."""
     module, name = _CONFIGS[kind]
@@ -165,15 +157,11 @@ def schema(
 
 @_plugin.command("new")
 def plugin_new(
-    name: Annotated[str, typer.Argument(help="Name of the plug-in in configs.")],
-    kind: Annotated[
-        str | None, typer.Option(metavar="KIND", help="calibrator, importer, cost or effect. Default: calibrator.")
-    ] = None,
-    effect: Annotated[bool, typer.Option("--effect", help="Short for --kind effect.")] = False,
-    folder: Annotated[
-        Path, typer.Option("--folder", "-o", "--output", metavar="DIR", help="Folder to write to.")
-    ] = Path("plugins"),
-    force: Force = False,
+    name: str = argument("Name of the plug-in in configs.", ...),
+    kind: str | None = option("calibrator, importer, cost or effect. Default: calibrator.", metavar="KIND"),
+    effect: bool = flag("Short for --kind effect.", "--effect"),
+    folder: Path = option("Folder to write to.", "--folder", "-o", "--output", default=Path("plugins"), metavar="DIR"),
+    force: bool = shared.FORCE,
 ) -> None:
     """Write a working plug-in and its test."""
     from omnibench.testing.plugin_files import new_plugin
@@ -189,9 +177,9 @@ def plugin_new(
 
 @_plugin.command("check")
 def plugin_check(
-    file: Annotated[Path, typer.Argument(help="Plug-in file.")],
-    sample: Annotated[Path | None, typer.Option(help="Sample recordings for an importer to read.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Longest time of the whole check, in s.")] = 600.0,
+    file: Path = argument("Plug-in file.", ...),
+    sample: Path | None = option("Sample recordings for an importer to read."),
+    seconds: float = option("Longest time of the whole check, in s.", default=600.0, min=0.1),
 ) -> None:
     """Run the conformance tests on a plug-in.
 

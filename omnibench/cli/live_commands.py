@@ -4,11 +4,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from omnibench.cli.options import Force, Plugins, load_given_plugins, output_option, plugin_folders
+from omnibench.cli import options as shared
+from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
@@ -20,36 +21,26 @@ if TYPE_CHECKING:
 live_app = typer.Typer()
 _LISTENING = 0.2  # s between two looks at whether a signal came; chosen
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", help="How to reach the node: YAML with zenoh, profile, domain; or the node's own config."),
-]
-Connect = Annotated[str | None, typer.Option("--connect", help="Endpoint of the node, for example tcp/127.0.0.1:7447.")]
-ProfileOption = Annotated[
-    Literal["plain", "rmw", "humble"] | None,
-    typer.Option(
-        help="Naming of topics: plain Zenoh, rmw_zenoh, or that of ROS 2 Humble. Default: as in --config, or plain."
-    ),
-]
-Seconds = Annotated[float | None, typer.Option(min=0.0, help="Stop after this time, in s. Default: on Ctrl-C.")]
+Profile = Literal["plain", "rmw", "humble"]
+_CONFIG = option("How to reach the node: YAML with zenoh, profile, domain; or the node's own config.", "--config")
+_CONNECT = option("Endpoint of the node, for example tcp/127.0.0.1:7447.", "--connect")
+_PROFILE = option(
+    "Naming of topics: plain Zenoh, rmw_zenoh, or that of ROS 2 Humble. Default: as in --config, or plain."
+)
+_SECONDS = option("Stop after this time, in s. Default: on Ctrl-C.", min=0.0)
 
 
 @live_app.command()
 def live(
-    config: Annotated[Path, typer.Argument(help="Config of the node (YAML).")],
-    dataset: Annotated[
-        Path | None,
-        typer.Argument(help="With --replay: data set folder, or config with a simulated one. Default: the config's."),
-    ] = None,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Play a recording to the node, show its errors, and end.")
-    ] = False,
-    speed: Annotated[
-        str | None, typer.Option(help="Speed of the replay: 1, 10, ... or max. Default: the config's.")
-    ] = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove's WebSocket on this computer.")] = False,
-    seconds: Seconds = None,
-    plugins: Plugins = None,
+    config: Path = argument("Config of the node (YAML).", ...),
+    dataset: Path | None = argument(
+        "With --replay: data set folder, or config with a simulated one. Default: the config's."
+    ),
+    replay: bool = flag("Play a recording to the node, show its errors, and end.", "--replay"),
+    speed: str | None = option("Speed of the replay: 1, 10, ... or max. Default: the config's."),
+    foxglove: bool = flag("Serve Foxglove's WebSocket on this computer.", "--foxglove"),
+    seconds: float | None = _SECONDS,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Run the node: wheel samples in, odometry out, over Zenoh.
 
@@ -60,7 +51,7 @@ def live(
     if replay and config.is_dir() and dataset is not None:  # --replay DATASET before CONFIG
         config, dataset = dataset, config
     chosen = read_live_config(config)
-    chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *plugin_folders(plugins))})
+    chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *shared.plugin_folders(plugins))})
     if foxglove and not chosen.foxglove:
         chosen = chosen.model_copy(update={"foxglove": True})
     if not replay:
@@ -120,23 +111,18 @@ def _replay_to_node(
 
 @live_app.command()
 def replay(
-    dataset: Annotated[Path, typer.Argument(help="Data set folder, or config with a simulated one.")],
-    robot: Annotated[str, typer.Option(help="Name of the robot that is played.")] = "robot",
-    speed: Annotated[str, typer.Option(help="1: as recorded; 10: ten times as fast; max: as fast as can be.")] = "1",
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Set what a node's config holds under replay; may be repeated."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration whose noise model gives the covariance of the SLAM poses.")
-    ] = None,
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
-    plugins: Plugins = None,
+    dataset: Path = argument("Data set folder, or config with a simulated one.", ...),
+    robot: str = option("Name of the robot that is played.", default="robot"),
+    speed: str = option("1: as recorded; 10: ten times as fast; max: as fast as can be.", default="1"),
+    settings: list[str] | None = option(
+        "Set what a node's config holds under replay; may be repeated.", "--set", metavar="KEY=VALUE"
+    ),
+    calibration: Path | None = option("Calibration whose noise model gives the covariance of the SLAM poses."),
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Play a recording onto Zenoh, as the robot and its SLAM would.
 
@@ -152,7 +138,7 @@ def replay(
     from omnibench.robot.calibration import read_calibration
 
     checked_robot(robot)
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     chosen = validate(ReplayConfig, {"speed": speed, **parse_settings(settings)}, "replay")
     noise = None if calibration is None else read_calibration(calibration).noise
     with ProgressDisplay() as watch:
@@ -172,12 +158,12 @@ def replay(
 
 @live_app.command()
 def listen(
-    robot: Annotated[str | None, typer.Argument(help="Name of the robot. Default: all that are heard.")] = None,
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document a line, once a second.")] = False,
+    robot: str | None = argument("Name of the robot. Default: all that are heard."),
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
+    as_json: bool = flag("Print one JSON document a line, once a second.", "--json"),
 ) -> None:
     """Show a robot's odometry live: pose, rate, age, health."""
     from omnibench.cli.terminal.live_tables import listen as show
@@ -193,11 +179,11 @@ def listen(
 
 @live_app.command()
 def swap(
-    robot: Annotated[str, typer.Argument(help="Name of the robot.")],
-    calibration: Annotated[Path, typer.Argument(help="Calibration file to run from now on.")],
-    config: ConfigOption = None,
-    connect: Connect = None,
-    plugins: Plugins = None,
+    robot: str = argument("Name of the robot.", ...),
+    calibration: Path = argument("Calibration file to run from now on.", ...),
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Give a running node another calibration, without a jump.
 
@@ -205,7 +191,7 @@ def swap(
     """
     from omnibench.live.control.query_server import swap_calibration
 
-    load_given_plugins(plugins)
+    shared.load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):
         swapped = swap_calibration(session, robot, calibration)
     if not swapped.kept:
@@ -215,19 +201,14 @@ def swap(
 
 @live_app.command()
 def record(
-    robots: Annotated[
-        list[str],
-        typer.Argument(metavar="ROBOT...|CONFIG", help="Names of robots, or the config of a node with them."),
-    ],
-    output: Annotated[Path, output_option("MCAP file to write.", metavar="FILE.mcap")],
-    config: ConfigOption = None,
-    connect: Connect = None,
-    profile: ProfileOption = None,
-    seconds: Seconds = None,
-    topics: Annotated[
-        list[str] | None, typer.Option("--topic", help="Record only this topic; may be repeated. Default: all.")
-    ] = None,
-    force: Force = False,
+    robots: list[str] = argument("Names of robots, or the config of a node with them.", ..., metavar="ROBOT...|CONFIG"),
+    output: Path = output_option("MCAP file to write.", default=..., metavar="FILE.mcap"),
+    config: Path | None = _CONFIG,
+    connect: str | None = _CONNECT,
+    profile: Profile | None = _PROFILE,
+    seconds: float | None = _SECONDS,
+    topics: list[str] | None = option("Record only this topic; may be repeated. Default: all.", "--topic"),
+    force: bool = shared.FORCE,
 ) -> None:
     """Record live topics into MCAP, for Foxglove and rosbags."""
     from omnibench.cli.terminal.live_tables import record as write
@@ -248,21 +229,17 @@ def record(
 
 @live_app.command()
 def keys(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
-    names: Annotated[list[str] | None, typer.Argument(help="Who gets a certificate. Default: node and client.")] = None,
-    router: Annotated[
-        str | None,
-        typer.Option(help="Who of these runs the node that the others connect to. Default: node.", metavar="NAME"),
-    ] = None,
-    hosts: Annotated[
-        list[str] | None,
-        typer.Option("--host", help="Name or address of the computer that this node runs on; may be repeated."),
-    ] = None,
-    days: Annotated[int, typer.Option(min=1, help="Validity, in days.")] = 365,
-    users: Annotated[bool, typer.Option("--users", help="Also make passwords, and a users.txt for the node.")] = False,
-    force: Annotated[
-        bool, typer.Option("--force", "--overwrite", help="Replace files that exist, the authority (CA) too.")
-    ] = False,
+    folder: Path = argument("Folder to write to.", ..., metavar="DIR"),
+    names: list[str] | None = argument("Who gets a certificate. Default: node and client."),
+    router: str | None = option(
+        "Who of these runs the node that the others connect to. Default: node.", metavar="NAME"
+    ),
+    hosts: list[str] | None = option(
+        "Name or address of the computer that this node runs on; may be repeated.", "--host"
+    ),
+    days: int = option("Validity, in days.", default=365, min=1),
+    users: bool = flag("Also make passwords, and a users.txt for the node.", "--users"),
+    force: bool = flag("Replace files that exist, the authority (CA) too.", "--force", "--overwrite"),
 ) -> None:
     """Make a test authority (CA) and certificates for mutual TLS."""
     from omnibench.live.network.keys import make_keys

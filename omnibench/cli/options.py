@@ -11,8 +11,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -31,129 +33,166 @@ if TYPE_CHECKING:
     from omnibench.report.blocks import Document
 
 
+def option(text: str, *names: str, default: Any = None, **settings: Any) -> Any:
+    """An option of a command, as the default of its parameter. text: its help. default: ``...`` if it must be given."""
+    return typer.Option(default, *names, help=text, **settings)
+
+
+def argument(text: str, default: Any = None, **settings: Any) -> Any:
+    """An argument of a command, as the default of its parameter. text, default: as of an option."""
+    return typer.Argument(default, help=text, **settings)
+
+
+def flag(text: str, *names: str) -> Any:
+    """An option without a value, which is False unless it is given. text: its help."""
+    return option(text, *names, default=False)
+
+
 def output_option(text: str, **settings: Any) -> Any:
     """``-o`` and ``--output``: the same two spellings for every command that writes files."""
-    return typer.Option("-o", "--output", help=text, **settings)
+    return option(text, "-o", "--output", **settings)
 
 
-DatasetFolder = Annotated[Path, typer.Argument(help="Data set folder.")]
-DatasetFolders = Annotated[
-    list[Path],
-    typer.Argument(help="Data set folder; several of one robot, or a glob, count as one.", metavar="DATASET..."),
-]
-CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file.")]
-WhichDataset = Annotated[str | None, typer.Option(help="Name of the data set, if the config has several.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, and nothing else.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
-Figures = Annotated[
-    Path | None,
-    typer.Option(
-        "--figures",
-        metavar="DIR",
-        help="Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).",
-    ),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set an option, its value in YAML; may be repeated."),
-]
-TableFormat = Annotated[Literal["parquet", "csv"], typer.Option("--format", help="Format of the data set's tables.")]
-Plugins = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--plugins",
-        metavar="DIR",
-        envvar="OMNIBENCH_PLUGINS",
-        help="Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
-    ),
-]
+def grouped(function: Callable[..., None]) -> Callable[..., None]:
+    """A command's function, in which a parameter that is by default a group of options stands for all of these.
 
+    A group is a dataclass whose fields are options; the function gets one with the values that were given.
+    """
+    groups, parameters = dict[str, Any](), list[inspect.Parameter]()
+    for parameter in inspect.signature(function).parameters.values():
+        if not is_dataclass(group := parameter.default):
+            parameters.append(parameter)
+            continue
+        groups[parameter.name], types = group, get_type_hints(type(group), include_extras=True)
+        for field in fields(group):
+            default = getattr(group, field.name)
+            parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
+
+    @wraps(function)
+    def command(*arguments: Any, **given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = replace(group, **{field.name: given.pop(field.name) for field in fields(group)})
+        function(*arguments, **given)
+
+    return _with_parameters(command, parameters)
+
+
+def _with_parameters(function: Callable[..., None], parameters: list[inspect.Parameter]) -> Callable[..., None]:
+    """A function for which Typer makes an option or argument of each of these parameters."""
+    function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return function
+
+
+DATASET = argument("Data set folder.", ...)
+DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
+CALIBRATION = argument("Calibration file.", ...)
+WHICH_DATASET = option("Name of the data set, if the config has several.")
+JSON = flag("Print one JSON document on standard output, and nothing else.", "--json")
+FORCE = flag("Replace what is there already.", "--force")
+FIGURES = option("Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).", metavar="DIR")
+SETTINGS = option("Set an option, its value in YAML; may be repeated.", "--set", metavar="KEY=VALUE")
+TableFormat = Literal["parquet", "csv"]
+TABLE_FORMAT = option("Format of the data set's tables.", "--format", default="parquet")
+PLUGINS = option(
+    "Folder of plug-ins; may be repeated. Default: ./plugins, if any; none: load none.",
+    "--plugins",
+    metavar="DIR",
+    envvar="OMNIBENCH_PLUGINS",
+)
+PLUGIN_FILES = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE")
 
 # Modules that jobs which read a data set share.
-_READING = ("omnibench.check.streams", "omnibench.check.clocks", "omnibench.robot.compiled_beforehand")
-BackendName = Annotated[
-    str | None,
-    typer.Option(
-        "--backend",
-        metavar="NAME",
-        help="Where many jobs are run: processes; dask (a cluster started here); tcp://HOST:PORT or tls://HOST:PORT, "
+_READING = ("omnibench.check.evidence", "omnibench.robot.compiled_beforehand")
+
+
+@dataclass(frozen=True)
+class BackendOptions:
+    """Options that say where many jobs are run: by default in this process."""
+
+    backend: str | None = option(
+        "Where many jobs are run: processes; dask (a cluster started here); tcp://HOST:PORT or tls://HOST:PORT, "
         "a scheduler of Dask.",
-    ),
-]
-TlsAuthority = Annotated[
-    Path | None, typer.Option("--tls-ca", metavar="FILE", help="For tls://: the authority's certificate.")
-]
-TlsCertificate = Annotated[
-    Path | None, typer.Option("--tls-cert", metavar="FILE", help="For tls://: this client's certificate.")
-]
-Workers = Annotated[
-    int | None, typer.Option(min=1, help="For --backend: processes, or Dask workers started here. Default: processors.")
-]
-TlsKey = Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="For tls://: this client's key.")]
-PluginFiles = Annotated[
-    list[Path] | None,
-    typer.Option("--plugin", metavar="FILE", help="One plug-in file to load; may be repeated."),
-]
+        metavar="NAME",
+    )
+    workers: int | None = option("For --backend: processes, or Dask workers started here. Default: processors.", min=1)
+    tls_ca: Path | None = option("For tls://: the authority's certificate.", metavar="FILE")
+    tls_cert: Path | None = option("For tls://: this client's certificate.", metavar="FILE")
+    tls_key: Path | None = option("For tls://: this client's key.", metavar="FILE")
+
+    @property
+    def tls(self) -> TlsFiles | None:
+        """The files of the options; None without any. ConfigError: some are given, not all."""
+        ca, cert, key = self.tls_ca, self.tls_cert, self.tls_key
+        if ca is None and cert is None and key is None:
+            return None
+        if ca is None or cert is None or key is None:
+            raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
+        from omnibench.jobs.job import TlsFiles
+
+        return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
+
+    @contextmanager
+    def opened(self, report: Reporter, *preload: str) -> Iterator[Backend | None]:
+        """The backend, open in the block; None where none was given: this process does the work.
+
+        In the block its workers read data sets larger than memory, of which ``report`` is told. preload: modules that
+        all jobs import.
+        """
+        from omnibench.progress import reading_told_to
+
+        tls = self.tls
+        if self.backend is None:
+            if self.workers is not None or tls is not None:
+                raise ConfigError("--workers and the files of TLS are for --backend; name one")
+            with reading_told_to(report):
+                yield None
+            return
+        from omnibench.jobs.backend_choice import BackendChoice, open_backend
+        from omnibench.robot.stored_odometry import read_by
+
+        choice = BackendChoice(name=self.backend, workers=self.workers or os.cpu_count() or 1, tls=tls)
+        with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
+            yield backend
 
 
-def tls_files(ca: Path | None, cert: Path | None, key: Path | None) -> TlsFiles | None:
-    """The files of the options; None without any. ConfigError: some are given, not all."""
-    if ca is None and cert is None and key is None:
-        return None
-    if ca is None or cert is None or key is None:
-        raise ConfigError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
-    from omnibench.jobs.job import TlsFiles
+@dataclass(frozen=True)
+class ReportOptions:
+    """Options of the commands that write a page on request."""
 
-    return TlsFiles(ca=ca.resolve(), cert=cert.resolve(), key=key.resolve())
+    report: Path | None = option("Write a page with figures.", metavar="FILE.html")
+    figures: Path | None = FIGURES
 
+    @property
+    def asked(self) -> bool:
+        """True if either is asked for."""
+        return self.report is not None or self.figures is not None
 
-@contextmanager
-def asked_backend(
-    name: str | None, workers: int | None, tls: TlsFiles | None, preload: Sequence[str], report: Reporter
-) -> Iterator[Backend | None]:
-    """The backend of ``--backend``, open in the block; None where none was given: this process does the work.
+    def refuse(self, *, force: bool) -> None:
+        """Before the work begins: ConfigError if the page is there, DataError if no figure can be drawn."""
+        refuse_existing(self.report, force=force)
+        refuse_figures_without_browser(self.figures)
 
-    In the block its workers read data sets larger than memory, of which ``report`` is told.
-    """
-    from omnibench.progress import reading_told_to
+    def write(self, page: Callable[[], Document], *, announced: bool = False) -> None:
+        """Write the page and its figures; it is made only where either is asked for.
 
-    if name is None:
-        if workers is not None or tls is not None:
-            raise ConfigError("--workers and the files of TLS are for --backend; name one")
-        with reading_told_to(report):
-            yield None
-        return
-    from omnibench.jobs.backend_choice import BackendChoice, open_backend
-    from omnibench.robot.stored_odometry import read_by
+        announced: say on standard error where the page is.
+        """
+        if not self.asked:
+            return
+        from omnibench.report.render import write_document
 
-    choice = BackendChoice(name=name, workers=workers or os.cpu_count() or 1, tls=tls)
-    with open_backend(choice, (*_READING, *preload), report) as backend, read_by(backend), reading_told_to(report):
-        yield backend
-
-
-def refuse_report(report: Path | None, figures: Path | None, *, force: bool) -> None:
-    """Before the work begins: ConfigError if the page of ``--report`` is there, DataError if no figure can be drawn."""
-    refuse_existing(report, force=force)
-    refuse_figures_without_browser(figures)
+        document = page()
+        if self.report is not None:
+            write_document(document, self.report)
+            if announced:
+                typer.echo(f"report: {self.report}", err=True)
+        write_asked_figures(document, self.figures)
 
 
-def write_asked_report(
-    page: Callable[[], Document], report: Path | None, figures: Path | None, *, announced: bool = False
-) -> None:
-    """Write the page of ``--report`` and the figures of ``--figures``; it is made only where either is asked for.
-
-    announced: say on standard error where the page is.
-    """
-    if report is None and figures is None:
-        return
-    from omnibench.report.render import write_document
-
-    document = page()
-    if report is not None:
-        write_document(document, report)
-        if announced:
-            typer.echo(f"report: {report}", err=True)
-    write_asked_figures(document, figures)
+def report_options(text: str) -> ReportOptions:
+    """The options ``--report``, of which ``text`` is the help, and ``--figures``."""
+    return ReportOptions(report=option(text, metavar="FILE.html"))
 
 
 def refuse_figures_without_browser(folder: Path | None) -> None:
@@ -170,12 +209,8 @@ def write_asked_figures(document: Document, folder: Path | None) -> None:
         from omnibench.report.figure_files import write_figures
 
         names = write_figures(document, folder)
-        what = (
-            f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)"
-            if names
-            else "none in the report"
-        )
-        typer.echo(f"figures: {what}", err=True)
+        shown = f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)" if names else ""
+        typer.echo(f"figures: {shown or 'none in the report'}", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
@@ -223,7 +258,9 @@ class FitCommand(TyperCommand):
         if not self._choices:
             from omnibench.fit.settings import FitSettings
 
-            made = options_of(FitSettings)
+            app = typer.Typer(add_completion=False)
+            app.command()(_with_parameters(lambda: None, list(_parameters(FitSettings))))
+            made: list[Any] = list(typer.main.get_command(app).params)
             self._choices = tuple(option.name for option in made)
             after = 1 + [parameter.name for parameter in self.params].index("output")
             self.params[after:after] = made
@@ -233,20 +270,6 @@ class FitCommand(TyperCommand):
         """Call the function, with the values of FitSettings' options in ``ctx.obj``."""
         ctx.obj = {name: ctx.params.pop(name) for name in self._choices}
         return super().invoke(ctx)
-
-
-def options_of(model: type[BaseModel]) -> list[Any]:
-    """Options of a command line for the fields of a model, and of models in it, that are text, a number or a flag."""
-
-    def chosen() -> None: ...
-
-    parameters = list(_parameters(model))
-    chosen.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    chosen.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    app = typer.Typer(add_completion=False)
-    app.command()(chosen)
-    command: Any = typer.main.get_command(app)
-    return list(command.params)
 
 
 def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
@@ -262,15 +285,13 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
         if schema is None:
             continue
-        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
+        kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
-        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
-        flag = [f"--{name}"] if annotation is bool else []
-        option = typer.Option(*flag, help=field.description, min=least)
-        annotation = annotation | None if field.default is None else annotation
-        yield inspect.Parameter(
-            name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=Annotated[annotation, option]
-        )
+        least = least + 1 if kind is int and "exclusiveMinimum" in schema else least
+        names = [f"--{name}"] if kind is bool else []
+        made = option(field.description or "", *names, default=field.default, min=least)
+        kind = kind | None if field.default is None else kind
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=kind)
 
 
 def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:

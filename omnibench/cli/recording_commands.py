@@ -1,17 +1,16 @@
 """``import``, ``fetch``, ``check``, ``inspect``, ``design``, ``slam`` and ``simulate``: recordings, old and new."""
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 from typer.core import TyperCommand
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, say, warn
+from omnibench.cli.options import argument, flag, option, output_option
+from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import refuse_existing, resolved, write_text
@@ -19,8 +18,6 @@ from omnibench.progress import Progress
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from omnibench.check.check import CheckReport
     from omnibench.report.blocks import Document
 
@@ -38,47 +35,34 @@ class HelpOfImporters(TyperCommand):
             if (name := given.get("importer")) is not None:
                 from omnibench.cli.terminal.importer_help import importer_help
 
-                shared.load_given_plugins(_paths(given.get("plugins")), _paths(given.get("plugin_files")))
+                lists = [given.get(key) for key in ("plugins", "plugin_files")]
+                shared.load_given_plugins(*(None if each is None else [Path(one) for one in each] for each in lists))
                 typer.echo(importer_help(str(name), ctx.command_path))
                 ctx.exit()
         return super().parse_args(ctx, args)
 
 
-def _paths(given: Any) -> list[Path] | None:
-    return [Path(each) for each in given] if isinstance(given, list) else None
-
-
 @recording_app.command("import", cls=HelpOfImporters)
 def import_(
-    importer: Annotated[
-        str,
-        typer.Argument(metavar="FORMAT", help="Format of the recordings; import FORMAT --help shows its options."),
-    ],
-    source: Annotated[Path | None, typer.Argument(help="File or folder with the recordings.")] = None,
-    output: Annotated[Path | None, shared.output_option("Data set folder to write.")] = None,
-    settings: shared.Settings = None,
-    accept_units: Annotated[
-        bool, typer.Option("--accept-units", help="Write the data set even if units look wrong by magnitude.")
-    ] = False,
-    template: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="csv, without SOURCE: write tables and robot.yaml to fill in."),
-    ] = None,
-    robot_type: Annotated[
-        Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None,
-        typer.Option(help="With --template: the robot's type. Default: diff."),
-    ] = None,
-    references: Annotated[
-        bool,
-        typer.Option(
-            "--references", help="With --template: distances and turned angles, measured by hand, instead of poses."
-        ),
-    ] = False,
-    no_check: Annotated[bool, typer.Option("--no-check", help="Leave out the check of what was recorded.")] = False,
-    table_format: shared.TableFormat = "parquet",
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    plugin_files: shared.PluginFiles = None,
+    importer: str = argument(
+        "Format of the recordings; import FORMAT --help shows its options.", ..., metavar="FORMAT"
+    ),
+    source: Path | None = argument("File or folder with the recordings."),
+    output: Path | None = output_option("Data set folder to write."),
+    settings: list[str] | None = shared.SETTINGS,
+    accept_units: bool = flag("Write the data set even if units look wrong by magnitude.", "--accept-units"),
+    template: Path | None = option("csv, without SOURCE: write tables and robot.yaml to fill in.", metavar="DIR"),
+    robot_type: Literal["diff", "omni3", "mecanum", "tricycle", "car", "swerve", "skid"] | None = option(
+        "With --template: the robot's type. Default: diff."
+    ),
+    references: bool = flag(
+        "With --template: distances and turned angles, measured by hand, instead of poses.", "--references"
+    ),
+    no_check: bool = flag("Leave out the check of what was recorded.", "--no-check"),
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    plugin_files: list[Path] | None = shared.PLUGIN_FILES,
 ) -> None:
     """Convert recordings into a data set.
 
@@ -86,6 +70,7 @@ def import_(
     robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
     scans but without reference poses get these by SLAM.
     """
+    from omnibench.cli.terminal.recording_tables import print_import_ending
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
@@ -151,38 +136,17 @@ def import_(
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-    return print_ending(holds, *_next_step(output, report))
-
-
-def _next_step(folder: Path, report: "CheckReport | None") -> tuple[Any, ...]:
-    """The next step after an import in words, then the words to type."""
-    if report is None:
-        return "see what they tell", "omnibench", "inspect", folder
-    if report.command:
-        return "mend what it warns of" if report.verdict == "ready" else "mend it", *shlex.split(report.command)
-    if report.verdict == "ready":
-        return "calibrate it", "omnibench", "calibrate", folder, "-o", "calibration.yaml"
-    return "see what is missing", "omnibench", "check", folder
-
-
-_NAMES = 12  # columns of the list's names, with the spaces around them
+    return print_import_ending(holds, output, report)
 
 
 @recording_app.command()
 def fetch(
-    name: Annotated[
-        str | None,
-        typer.Argument(help="One of the list that is shown without it, or any OWNER/REPO on GitHub."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        shared.output_option("Data set folder to write; of several data sets, the folder above. Default: data/NAME."),
-    ] = None,
-    commit: Annotated[
-        str | None,
-        typer.Option(metavar="SHA", help="Commit to take; HEAD: the newest. Default: the one that was tested."),
-    ] = None,
-    force: shared.Force = False,
+    name: str | None = argument("One of the list that is shown without it, or any OWNER/REPO on GitHub."),
+    output: Path | None = output_option(
+        "Data set folder to write; of several data sets, the folder above. Default: data/NAME."
+    ),
+    commit: str | None = option("Commit to take; HEAD: the newest. Default: the one that was tested.", metavar="SHA"),
+    force: bool = shared.FORCE,
 ) -> None:
     """Clone a public recording from GitHub and import it.
 
@@ -191,167 +155,100 @@ def fetch(
     from omnibench.cli.fetch import RECORDINGS, fetch_recording
 
     if name is None:
-        width = make_console().width
         for recording in RECORDINGS:
             typer.echo(f"{recording.repository} ({recording.licence}); reference: {recording.reference}")
-            for listed in recording.datasets:
-                text = f"{listed.robot}: {listed.runs}"
-                typer.echo(fill(text, width, initial_indent=f"  {listed.name:10}", subsequent_indent=" " * _NAMES))
+            print_names({listed.name: f"{listed.robot}: {listed.runs}" for listed in recording.datasets}, 10)
         print_ending("these are the public recordings that are known", "fetch one", "omnibench", "fetch", "omni3")
         return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
-    for folder, dataset in fetched.datasets.items():
-        warn(f"{folder}: {each}" if len(fetched.datasets) > 1 else each for each in dataset.warnings)
-    for folder, dataset in fetched.datasets.items():
-        typer.echo(f"{plural(len(dataset.trajectories), 'trajectory')}: {folder}")
-    say(f"source: {fetched.source}, in {fetched.clone.folder}")
+    several = len(fetched.datasets) > 1
+    for folder, imported in fetched.datasets.items():
+        warn(f"{folder}: {each}" if several else each for each in imported.warnings)
+    for folder, imported in fetched.datasets.items():
+        typer.echo(f"{plural(len(imported.trajectories), 'trajectory')}: {folder}")
+    first, dataset = next(iter(fetched.datasets.items()), (fetched.folder, None))
     licence = fetched.licence or "the repository states none; ask its authors before you use it"
     if fetched.licence_file is not None:
-        place = next(iter(fetched.datasets), fetched.clone.folder) / fetched.licence_file.name
-        licence = f"{fetched.licence or 'see'} ({place})"
-    say(f"licence: {licence}")
-    say(f"cite: {fetched.cite}")
-    # What there is now, and what to type.
-    clone = fetched.clone
-    if fetched.datasets:
-        folder, dataset = next(iter(fetched.datasets.items()))
-        count = plural(len(dataset.trajectories), "run")
-        rest = f" and {plural(len(fetched.datasets) - 1, 'more folder')}" if len(fetched.datasets) > 1 else ""
-        holds = f"{folder} holds {count} of {dataset.robot.name}" if not rest else f"{folder}{rest} hold the recordings"
-        return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", folder)
+        licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
+    for line in (f"source: {fetched.source}, in {fetched.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
+        say(line)
+    holds = f"{fetched.folder} holds {fetched.repository}"
+    if dataset is not None:
+        holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
+        if several:
+            holds = f"{first} and {plural(len(fetched.datasets) - 1, 'more folder')} hold the recordings"
+        return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", first)
     make_console(error=True).print(f"not imported: {fetched.refusal}", soft_wrap=True)
     if not fetched.importer:
-        return print_ending(f"{clone.folder} holds {clone.repository}", "see what can be imported", "omnibench", "list")
-    command = ("omnibench", "import", fetched.importer, "--help")
-    return print_ending(f"{clone.folder} holds {clone.repository}", "see what its import needs", *command)
+        return print_ending(holds, "see what can be imported", "omnibench", "list")
+    return print_ending(holds, "see what its import needs", "omnibench", "import", fetched.importer, "--help")
 
 
 @recording_app.command()
+@shared.grouped
 def check(
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Data set folder, or several; folder or file of CSV tables, or a bag.", metavar="SOURCE..."
-        ),
-    ],
-    importer: Annotated[
-        str | None,
-        typer.Option("--format", metavar="NAME", help="Importer of the source. Default: by its files."),
-    ] = None,
-    robot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="robot.yaml, where the source does not say the robot.")
-    ] = None,
-    settings: shared.Settings = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of clocks and findings.")
-    ] = None,
-    figures: shared.Figures = None,
-    plugin: Annotated[
-        list[Path] | None, typer.Option("--plugin", metavar="FILE", help="A plug-in with an importer; may be repeated.")
-    ] = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    force: shared.Force = False,
-    as_json: shared.Json = False,
+    source: list[Path] = argument(
+        "Data set folder, or several; folder or file of CSV tables, or a bag.", ..., metavar="SOURCE..."
+    ),
+    importer: str | None = option("Importer of the source. Default: by its files.", "--format", metavar="NAME"),
+    robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
+    settings: list[str] | None = shared.SETTINGS,
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of clocks and findings."),
+    plugin: list[Path] | None = option("A plug-in with an importer; may be repeated.", "--plugin", metavar="FILE"),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
+    force: bool = shared.FORCE,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Say what is wrong with a recording, and what to type.
 
     Nothing is changed. Exit 0: ready; 1: fix or record more; 2: the source cannot be read.
     """
     from omnibench.check.check import check_recording
-    from omnibench.check.source import next_command, read_source
+    from omnibench.check.source import read_source
+    from omnibench.cli.terminal.recording_tables import print_check
     from omnibench.config import parse_settings
 
-    shared.refuse_report(report, figures, force=force)
+    page.refuse(force=force)
     shared.load_given_plugins([Path("none")], plugin)
-    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
+    with ProgressDisplay() as watch, jobs.opened(watch):
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
 
-    def page() -> "Document":
+    def document() -> "Document":
         from omnibench.report.recording.inspection_report import check_document
 
         return check_document(read.dataset, checked)
 
-    shared.write_asked_report(page, report, figures, announced=True)
+    page.write(document, announced=True)
     if as_json:
         print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
     else:
-        _print_check(make_console(), checked, next_command(read))
+        print_check(make_console(), checked, read.next_command())
     if checked.verdict != "ready":
         raise typer.Exit(1)
 
 
-_COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
-_NEEDED = {True: "a calibration is needed", False: "a calibration is hardly needed", None: ""}
-
-
-def _print_check(console: "Console", checked: "CheckReport", next_step: str) -> None:
-    """Print the report; what can be typed is not wrapped, so that it can be copied.
-
-    next_step: the command line for a recording that is ready.
-    """
-    from rich.text import Text
-
-    colour = {"ready": "bold green", "fix": "bold red", "record more": "bold yellow"}[checked.verdict]
-    console.print(Text.assemble((checked.verdict.upper(), colour), f": {checked.sentence}."), soft_wrap=True)
-    for finding in checked.findings:
-        console.print()
-        said = Text.assemble((finding.severity, _COLOURS[finding.severity]), f": {finding.what} [{finding.where}]")
-        console.print(said, soft_wrap=True)
-        if finding.changes and finding.fix:
-            console.out(f"  --set {finding.fix}", highlight=False)
-        elif finding.fix:
-            console.print(f"  {finding.fix}", soft_wrap=True)
-    if checked.gain:
-        needed = _NEEDED[checked.needed]
-        console.print()
-        console.print(f"{needed}: {checked.gain}" if needed else checked.gain, soft_wrap=True)
-    console.print()
-    if checked.command and checked.verdict == "ready":
-        print_ending("nothing stands in the way", "mend what it warns of", *shlex.split(checked.command))
-    elif checked.command:
-        print_ending("what can be mended is mended by one import", "type", *shlex.split(checked.command))
-    elif checked.verdict == "record more":
-        print_ending("nothing of this can be typed", "record what is missing, and check again")
-    elif checked.verdict == "fix":
-        print_ending("no option mends this", "correct what is named above, and check again")
-    else:
-        words = shlex.split(next_step)
-        print_ending("nothing stands in the way", f"{words[1]} it", *words)
-
-
 @recording_app.command()
+@shared.grouped
 def inspect(
-    dataset: shared.DatasetFolders,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Write a page: paths, motions driven, wheel rates, runs step by step."),
-    ] = None,
-    figures: shared.Figures = None,
-    backend: shared.BackendName = None,
-    workers: shared.Workers = None,
-    tls_ca: shared.TlsAuthority = None,
-    tls_cert: shared.TlsCertificate = None,
-    tls_key: shared.TlsKey = None,
-    force: shared.Force = False,
-    as_json: shared.Json = False,
+    dataset: list[Path] = shared.DATASETS,
+    page: shared.ReportOptions = shared.report_options(
+        "Write a page: paths, motions driven, wheel rates, runs step by step."
+    ),
+    jobs: shared.BackendOptions = shared.BackendOptions(),
+    force: bool = shared.FORCE,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
-    from omnibench.cli.terminal.inspection_summary import print_inspection
+    from omnibench.cli.terminal.recording_tables import print_inspection
     from omnibench.report.recording.inspection_report import inspection_document
 
-    shared.refuse_report(report, figures, force=force)
-    tls = shared.tls_files(tls_ca, tls_cert, tls_key)
-    with ProgressDisplay() as watch, shared.asked_backend(backend, workers, tls, (), watch):
+    page.refuse(force=force)
+    with ProgressDisplay() as watch, jobs.opened(watch):
         recordings = omnibench.load_dataset(dataset)
         inspection = omnibench.inspect_dataset(recordings)
-    shared.write_asked_report(lambda: inspection_document(recordings, inspection), report, figures, announced=True)
+    page.write(lambda: inspection_document(recordings, inspection), announced=True)
     if as_json:
         return print_json(inspection)
     print_inspection(make_console(), inspection)
@@ -368,67 +265,43 @@ def inspect(
 
 @recording_app.command()
 def design(
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATASET|CONFIG", help="Data set folder, or config of a comparison or a design."),
-    ] = None,
-    use: Annotated[
-        Literal["trajectory", "final"],
-        typer.Option(help="Reference poses to calibrate from: all of a run's, or only its final one."),
-    ] = "trajectory",
-    per: Annotated[
-        Literal["run", "second", "metre"], typer.Option(help="Effort to keep small: runs, time or distance.")
-    ] = "run",
-    runs: Annotated[
-        int | None, typer.Option(min=1, help="Runs to choose. Default: the fewest within 1 % of the optimum.")
-    ] = None,
-    repetitions: Annotated[int | None, typer.Option(min=1, help="How often a command may be chosen at most.")] = None,
-    dataset: shared.WhichDataset = None,
-    integration: Annotated[
-        Literal["euler", "arc"] | None,
-        typer.Option(help="Path within a sample; see calibrate. Default: the config's, or arc for a data set."),
-    ] = None,
-    robot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."),
-    ] = None,
-    max_speed: Annotated[
-        float | None, typer.Option(help="With --robot: its greatest speed, m/s. Default: 0.5.")
-    ] = None,
-    max_turn_rate: Annotated[
-        float | None, typer.Option(help="With --robot: its fastest turn, rad/s. Default: 1.")
-    ] = None,
-    max_wheel_rate: Annotated[
-        float | None,
-        typer.Option(help="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."),
-    ] = None,
-    steering_limit: Annotated[
-        float | None,
-        typer.Option(help="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."),
-    ] = None,
-    area: Annotated[
-        str | None, typer.Option(metavar="AxB", help="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
-    ] = None,
-    position_noise: Annotated[
-        float | None, typer.Option(help="With --robot: of the reference's positions, m. Default: 0.005.")
-    ] = None,
-    heading_noise: Annotated[
-        float | None, typer.Option(help="With --robot: of the reference's headings, deg. Default: 0.3.")
-    ] = None,
-    output: Annotated[
-        Path | None, shared.output_option("Folder for report.html and design.json. Default: nothing is written.")
-    ] = None,
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    source: Path | None = argument("Data set folder, or config of a comparison or a design.", metavar="DATASET|CONFIG"),
+    use: Literal["trajectory", "final"] = option(
+        "Reference poses to calibrate from: all of a run's, or only its final one.", default="trajectory"
+    ),
+    per: Literal["run", "second", "metre"] = option("Effort to keep small: runs, time or distance.", default="run"),
+    runs: int | None = option("Runs to choose. Default: the fewest within 1 % of the optimum.", min=1),
+    repetitions: int | None = option("How often a command may be chosen at most.", min=1),
+    dataset: str | None = shared.WHICH_DATASET,
+    integration: Literal["euler", "arc"] | None = option(
+        "Path within a sample; see calibrate. Default: the config's, or arc for a data set."
+    ),
+    robot: Path | None = option(
+        "Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml).", metavar="FILE"
+    ),
+    max_speed: float | None = option("With --robot: its greatest speed, m/s. Default: 0.5."),
+    max_turn_rate: float | None = option("With --robot: its fastest turn, rad/s. Default: 1."),
+    max_wheel_rate: float | None = option(
+        "With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
+    ),
+    steering_limit: float | None = option(
+        "With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
+    ),
+    area: str | None = option("With --robot: free floor, m, like 3x2.5. Default: 3x3.", metavar="AxB"),
+    position_noise: float | None = option("With --robot: of the reference's positions, m. Default: 0.005."),
+    heading_noise: float | None = option("With --robot: of the reference's headings, deg. Default: 0.3."),
+    output: Path | None = output_option("Folder for report.html and design.json. Default: nothing is written."),
+    figures: Path | None = shared.FIGURES,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Choose the motion commands that are most worth driving.
 
     These are the runs from which the matrix would be calibrated most precisely (D-optimal design): of those that were
     recorded or that a config lists, or, with --robot, of lines, arcs and turns that fit robot and room.
     """
-    from omnibench.cli.terminal.design_summary import print_design
+    from omnibench.cli.terminal.recording_tables import print_design
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.report import design_document
@@ -463,39 +336,26 @@ def design(
 
 
 @recording_app.command()
+@shared.grouped
 def slam(
-    dataset: Annotated[Path, typer.Argument(help="Data set folder with laser scans.")],
-    output: Annotated[Path | None, shared.output_option("Data set folder to write, with the new poses.")] = None,
-    start: Annotated[
-        Literal["odometry", "last_pose"] | None,
-        typer.Option(help="First guess of each scan's pose. Default: odometry."),
-    ] = None,
-    no_deskew: Annotated[
-        bool, typer.Option("--no-deskew", help="Leave out the correction for the robot's motion during a scan.")
-    ] = False,
-    model: Annotated[
-        Path | None,
-        typer.Option(metavar="CALIBRATION", help="Calibration for that odometry. Default: the design values."),
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder that simulate --truth wrote: show the errors against it."),
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of scans, paths and wheels.")
-    ] = None,
-    figures: shared.Figures = None,
-    settings: shared.Settings = None,
-    table_format: shared.TableFormat = "parquet",
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
-    as_json: shared.Json = False,
+    dataset: Path = argument("Data set folder with laser scans.", ...),
+    output: Path | None = output_option("Data set folder to write, with the new poses."),
+    start: Literal["odometry", "last_pose"] | None = option("First guess of each scan's pose. Default: odometry."),
+    no_deskew: bool = flag("Leave out the correction for the robot's motion during a scan.", "--no-deskew"),
+    model: Path | None = option("Calibration for that odometry. Default: the design values.", metavar="CALIBRATION"),
+    truth: Path | None = option("Folder that simulate --truth wrote: show the errors against it.", metavar="DIR"),
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of scans, paths and wheels."),
+    settings: list[str] | None = shared.SETTINGS,
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Compute reference poses from the laser scans of a data set.
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.slam_summary import print_slam
+    from omnibench.cli.terminal.recording_tables import print_slam
     from omnibench.config import parse_settings, validate
     from omnibench.slam.slam_dataset import SlamRequest
     from omnibench.slam.slam_options import SlamOptions
@@ -506,24 +366,24 @@ def slam(
     request = SlamRequest(
         dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
     )
-    shared.refuse_report(report, figures, force=force)
-    if output is None and report is None and figures is None and not as_json:
+    page.refuse(force=force)
+    if output is None and not page.asked and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
         result = request.run(watch, table_format)
 
-        def page() -> "Document":
+        def document() -> "Document":
             from omnibench.report.recording.section import recording_document
 
             watch(Progress("writing the report"))
             return recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
 
-        shared.write_asked_report(page, report, figures)
+        page.write(document)
     warn(result.summary.warnings)
     if as_json:
         return print_json(result.summary)
     print_slam(make_console(), result.summary)
-    for what, file in (("report", report), (plural(result.summary.runs, "trajectory"), output)):
+    for what, file in (("report", page.report), (plural(result.summary.runs, "trajectory"), output)):
         if file is not None:
             typer.echo(f"{what}: {file}")
     poses = f"{plural(result.summary.scans, 'scan')} gave poses"
@@ -533,36 +393,25 @@ def slam(
 
 
 @recording_app.command()
+@shared.grouped
 def simulate(
-    output: Annotated[Path, shared.output_option("Data set folder to write.")],
-    config: Annotated[Path | None, typer.Argument(help="Config with a simulated data set.")] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the truth: matrix, effects, true poses. Default: not written."),
-    ] = None,
-    dataset: shared.WhichDataset = None,
-    effects: Annotated[
-        list[str] | None,
-        typer.Option("--effect", metavar="YAML", help="Add an effect, 'name: {parameter: value}'; may be repeated."),
-    ] = None,
-    like: Annotated[
-        Path | None,
-        typer.Option(metavar="DATASET", help="Instead of CONFIG: drive this data set's recorded wheel rates."),
-    ] = None,
-    model: Annotated[
-        Path | None, typer.Option(metavar="CALIBRATION", help="With --like: the true model, a calibration file.")
-    ] = None,
-    noise: Annotated[
-        bool, typer.Option("--noise", help="With --like: add the noise that the calibration states.")
-    ] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="With --noise: its seed. Default: 0.")] = None,
-    table_format: shared.TableFormat = "parquet",
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Write a page with figures of the recording and the truth.")
-    ] = None,
-    figures: shared.Figures = None,
-    force: shared.Force = False,
-    plugins: shared.Plugins = None,
+    output: Path = output_option("Data set folder to write.", default=...),
+    config: Path | None = argument("Config with a simulated data set."),
+    truth: Path | None = option(
+        "Folder for the truth: matrix, effects, true poses. Default: not written.", metavar="DIR"
+    ),
+    dataset: str | None = shared.WHICH_DATASET,
+    effects: list[str] | None = option(
+        "Add an effect, 'name: {parameter: value}'; may be repeated.", "--effect", metavar="YAML"
+    ),
+    like: Path | None = option("Instead of CONFIG: drive this data set's recorded wheel rates.", metavar="DATASET"),
+    model: Path | None = option("With --like: the true model, a calibration file.", metavar="CALIBRATION"),
+    noise: bool = flag("With --like: add the noise that the calibration states.", "--noise"),
+    seed: int | None = option("With --noise: its seed. Default: 0.", min=0),
+    table_format: shared.TableFormat = shared.TABLE_FORMAT,
+    page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
     """Simulate recordings of a robot whose true model is known.
 
@@ -572,12 +421,12 @@ def simulate(
 
     hidden = tuple(effects or ())
     request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
-    shared.refuse_report(report, figures, force=force)
+    page.refuse(force=force)
     shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
 
-        def page() -> "Document":
+        def document() -> "Document":
             from omnibench.report.recording.section import recording_document
 
             watch(Progress("writing the report"))
@@ -585,15 +434,15 @@ def simulate(
             known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
             return recording_document(made.dataset, accuracy=made.accuracy, **known)
 
-        shared.write_asked_report(page, report, figures)
+        page.write(document)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
-        from omnibench.cli.terminal.slam_summary import print_slam_accuracy  # with the report's tables: slow to import
+        from omnibench.cli.terminal.recording_tables import print_slam_accuracy
 
         print_slam_accuracy(make_console(), made.accuracy)
     if truth is not None:
         typer.echo(f"truth: {truth / 'truth.yaml'}")
-    if report is not None:
-        typer.echo(f"report: {report}")
+    if page.report is not None:
+        typer.echo(f"report: {page.report}")
     typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")
     print_ending(f"{output} is a data set like any other", "see what it tells", "omnibench", "inspect", output)

@@ -4,23 +4,23 @@ Fit the plain matrix; screen its residuals for all that could explain them; sele
 extend the model by these; confirm them once the noise is known better; compare plain and extended model on runs that
 were held out; conclude.
 
-The conclusion: the verdict of a discovery, and what its steps returned, put into one result.
+The conclusion is the verdict of a discovery, in words, beside what its steps returned.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover import held_out as validating
 from omnibench.discover import result
-from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, without_smooth_term
 from omnibench.discover.experiments import experiments_for
 from omnibench.discover.fitting import Extended, Fit, extend, fit_matrix, in_windows, without_effects
 from omnibench.discover.regressors.fine_structure import fine_structure
@@ -33,12 +33,14 @@ from omnibench.discover.selection.model_selection import (
     SURE,
     Screening,
     Selection,
+    covariate_dependences,
     screen_again,
     screen_extended,
     screen_plain,
     select_effects,
     select_motor_effects,
     significance_left,
+    without_smooth_term,
 )
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.environment import package_versions
@@ -197,92 +199,6 @@ def sessions_in_words(
 _WORSE = 1.05  # times the plain matrix's error; nothing but a warning hangs on it
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """The results of all steps of a discovery.
-
-    baseline: the plain matrix, fitted to the runs and noise of the extended model. term_notes: on the term without a
-    name, if one was asked for.
-    """
-
-    screening: Screening
-    selection: Selection
-    effects: tuple[result.NamedEffect, ...]
-    dependences: Dependences
-    verdict: result.Verdict
-    term_notes: tuple[str, ...]
-    baseline: Extended
-    extended: Extended
-    validation: validating.ValidationRuns
-    held_out: tuple[result.HeldOut, ...]
-    steps: tuple[result.Step, ...]
-    extrapolations: tuple[result.Extrapolation, ...]
-    detectability: rivals.Detectability
-    experiments: tuple[result.Experiment, ...]
-    sessions: SessionComparison
-    eq6_of_sessions: float | None
-
-
-@dataclass(frozen=True)
-class Request:
-    """The options of a discovery, as discover_effects was called with them."""
-
-    without: tuple[str, ...]
-    unknown_term: bool
-    seed: int
-
-
-def conclude(dataset: Dataset, request: Request, findings: Findings, seconds: float) -> result.Discovery:
-    """The result of a discovery that took so many seconds."""
-    baseline, extended, held_out = findings.baseline, findings.extended, findings.held_out
-    fit, effects, limits = extended.fit, findings.effects, findings.detectability
-    inliers = fit.at_inliers.runs
-    where, left = findings.dependences.where, findings.dependences.left
-    trained = {run.session for run in fit.runs}
-    of_sessions = sessions_in_words(findings.verdict, findings.sessions, held_out, findings.eq6_of_sessions, trained)
-    named = ("tyre_wear",) if worn(findings.sessions, trained) else ()  # in the headline
-    absorbed = tuple(each for each in limits.absorbed if each.name not in named)
-    few, differ, doubts = result.few_in_words(fit.runs), bool(of_sessions), findings.sessions.doubts
-    of_model = headline_of(findings.verdict, effects, where, left, few, differ=differ, untested=bool(doubts))
-    headline = " ".join([*of_sessions, of_model, *(doubts if findings.verdict == "none" else ()), *_warnings(findings)])
-    needs_session = any("session" in term.effect.needs for term in fit.model.terms)
-    return result.Discovery(
-        dataset=replace(dataset, trajectories=(*inliers, *findings.validation.runs)),
-        dataset_hash=dataset.hash,
-        simulated=dataset.simulated,
-        verdict=findings.verdict,
-        headline=headline,
-        effects=effects,
-        candidates=rivals.candidates_of(findings.selection),
-        where=where,
-        left=left,
-        absorbed=tuple(effect.name for effect in absorbed),
-        measurements=absorbed,
-        not_looked_for=tuple(result.NotLookedFor(name, missing.value) for name, missing in limits.not_looked_for),
-        classes=limits.classes,
-        hidden=limits.hidden,
-        gap=held_out[0 if needs_session else -1].eq6 if held_out else validating.training_gap(baseline, extended),
-        held_out=held_out,
-        steps=findings.steps,
-        extrapolations=findings.extrapolations,
-        experiments=findings.experiments,
-        notes=(*_notes(findings), *findings.term_notes, *findings.validation.warnings),
-        noise=fit.noise,
-        outliers=fit.jumps,
-        poses=sum(len(run.pose_times) - 1 for run in inliers),
-        plain=_calibration_of(dataset, baseline, "plain", request, headline),
-        extended=_calibration_of(dataset, extended, "extended", request, headline, baseline),
-        trajectories=tuple(run.id for run in fit.runs),
-        before=_of_inliers(fit, baseline.fit.residuals),
-        after=_of_inliers(fit, fit.residuals),
-        whitened_before=_whitened(fit, baseline.fit.residuals),
-        whitened_after=_whitened(fit, fit.residuals),
-        sessions=findings.sessions,
-        eq6_of_sessions=findings.eq6_of_sessions,
-        seconds=seconds,
-    )
-
-
 def _of_inliers(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
     """Residuals (k, 3) of the fit's inliers, of those (K, 3) of all poses."""
     return tuple(of_run[inliers] for of_run, inliers in zip(residuals, fit.masks, strict=True))
@@ -293,10 +209,12 @@ def _whitened(fit: Fit, residuals: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(whiten(of_run) for whiten, of_run in zip(fit.weightings, residuals, strict=True))
 
 
-def _warnings(findings: Findings) -> Iterator[str]:
-    """A warning for each kind of held-out runs that the extended model predicts worse than the plain matrix."""
-    session = result.is_other_session(findings.extended.fit.runs, findings.validation.runs)
-    for held in findings.held_out:
+def _warnings(held_out: Sequence[result.HeldOut], *, session: bool) -> Iterator[str]:
+    """A warning for each kind of held-out runs that the extended model predicts worse than the plain matrix.
+
+    session: True if the validation split is known to be of another session.
+    """
+    for held in held_out:
         where = "repetitions that were held out"
         if held.data == "session":
             where = "the held-out session" if session else "the held-out runs"
@@ -314,14 +232,8 @@ def _warnings(findings: Findings) -> Iterator[str]:
             yield f"Beware: on {where} the extended model is worse than the plain matrix {' and '.join(worse)}."
 
 
-def _notes(findings: Findings) -> Iterator[str]:
-    """Notes on the runs, the noise, the encoders, the nuisances, and effects that others could imitate."""
-    fit = findings.extended.fit
-    few = result.few_in_words(fit.runs)
-    if findings.verdict != "none":  # else the headline says it
-        yield from (*findings.sessions.of_other_commands, *findings.sessions.doubts)
-    if few and findings.verdict != "none":
-        yield f"These are {few}: so little can show hardly anything."
+def _notes(fit: Fit, screening: Screening, sums: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
+    """Notes on the noise, the encoders, the nuisances, and effects that several others (sums) could imitate."""
     yield f"Noise: {fit.noise.description}."
     if fit.noise.source != "repetitions":
         yield "Without repetitions of a command nothing says how small the errors could be: no gap is closed."
@@ -330,7 +242,7 @@ def _notes(findings: Findings) -> Iterator[str]:
         if fit.jumps > 1:
             contradict = "poses that contradict their neighbours were"
         yield f"{fit.jumps} reference {contradict} left out."
-    quantisation = findings.screening.quantisation
+    quantisation = screening.quantisation
     if quantisation is not None and quantisation.steps.any():
         yield (
             f"The wheels were read in ticks of {np.degrees(quantisation.steps.max()):.2g} deg; what is left by "
@@ -344,7 +256,7 @@ def _notes(findings: Findings) -> Iterator[str]:
     ):
         if size:
             yield f"{words[0].upper()}{words[1:]}; estimated for each run."
-    for name, others in findings.detectability.sums:
+    for name, others in sums:
         yield f"{name} could be imitated by {' and '.join(others)} together."
 
 
@@ -352,26 +264,24 @@ def _calibration_of(
     dataset: Dataset,
     extended: Extended,
     name: str,
-    request: Request,
-    reason: str,
+    choices: Mapping[str, Any],
     plain: Extended | None = None,
 ) -> Calibration:
     """The calibration of a fit with its noise, covariance and provenance.
 
-    reason: why the fit ended, in words. plain: the fit of the plain matrix, to which the effects of a model fade.
+    choices: options and seed, and why the fit ended. plain: the fit of the plain matrix, to which the effects of a
+    model fade.
     """
     terms = tuple(EffectTerm.of(term) for term in extended.fit.model.terms)
     provenance = {
         "calibrator": "discover",
-        "options": {"without": list(request.without), "unknown_term": request.unknown_term},
-        "seed": request.seed,
         "cost": "final_pose",
         "box": "none",
         "versions": package_versions(),
         "training_cost": _cost(extended, dataset.split("train")),
         "validation_cost": _cost(extended, dataset.split("validation")),
         "outcome": "converged",
-        "reason": reason,
+        **choices,
     }
     calibration = calibration_of_fit(
         f"{dataset.name} {name}",
@@ -481,27 +391,62 @@ def discover_effects(
         progress.begin("choosing runs that tell the look-alikes apart")
     experiments = experiments_for(dataset, effects, models.weighted)
 
-    findings = Findings(
-        screening=screening,
-        selection=selection,
-        effects=effects,
-        dependences=dependences,
+    progress.end()
+
+    # The conclusion: sentences on sessions and models for the top of the report, notes, and calibrations.
+    fit, where, left = extended.fit, dependences.where, dependences.left
+    inliers, few = fit.at_inliers.runs, result.few_in_words(fit.runs)
+    trained = {run.session for run in fit.runs}
+    of_sessions = sessions_in_words(verdict, sessions, held_out, eq6_of_sessions, trained)
+    differ, untested = bool(of_sessions), bool(sessions.doubts)
+    of_model = headline_of(verdict, effects, where, left, few, differ=differ, untested=untested)
+    doubts = sessions.doubts if verdict == "none" else ()
+    warnings = _warnings(held_out, session=result.is_other_session(fit.runs, validation.runs))
+    headline = " ".join([*of_sessions, of_model, *doubts, *warnings])
+    notes: list[str] = []
+    if verdict != "none":  # else the headline says it
+        notes += [*sessions.of_other_commands, *sessions.doubts]
+        notes += [f"These are {few}: so little can show hardly anything."] if few else []
+    notes += [*_notes(fit, screening, detectability.sums), *term_notes, *filter(None, [average.note])]
+    absorbed = tuple(each for each in detectability.absorbed if each.name != "tyre_wear" or not worn(sessions, trained))
+    needs_session = any("session" in term.effect.needs for term in fit.model.terms)
+    options = {"without": list(without), "unknown_term": unknown_term}
+    choices = {"options": options, "seed": seed, "reason": headline}
+    return result.Discovery(
+        dataset=replace(dataset, trajectories=(*inliers, *validation.runs)),
+        dataset_hash=dataset.hash,
+        simulated=dataset.simulated,
         verdict=verdict,
-        term_notes=(*term_notes, *filter(None, [average.note])),
-        baseline=baseline,
-        extended=extended,
-        validation=validation,
+        headline=headline,
+        effects=effects,
+        candidates=rivals.candidates_of(selection),
+        where=where,
+        left=left,
+        absorbed=tuple(effect.name for effect in absorbed),
+        measurements=absorbed,
+        not_looked_for=tuple(result.NotLookedFor(name, lack.value) for name, lack in detectability.not_looked_for),
+        classes=detectability.classes,
+        hidden=detectability.hidden,
+        gap=held_out[0 if needs_session else -1].eq6 if held_out else validating.training_gap(baseline, extended),
         held_out=held_out,
         steps=steps,
         extrapolations=extrapolations,
-        detectability=detectability,
         experiments=experiments,
+        notes=(*notes, *validation.warnings),
+        noise=fit.noise,
+        outliers=fit.jumps,
+        poses=sum(len(run.pose_times) - 1 for run in inliers),
+        plain=_calibration_of(dataset, baseline, "plain", choices),
+        extended=_calibration_of(dataset, extended, "extended", choices, baseline),
+        trajectories=tuple(run.id for run in fit.runs),
+        before=_of_inliers(fit, baseline.fit.residuals),
+        after=_of_inliers(fit, fit.residuals),
+        whitened_before=_whitened(fit, baseline.fit.residuals),
+        whitened_after=_whitened(fit, fit.residuals),
         sessions=sessions,
         eq6_of_sessions=eq6_of_sessions,
+        seconds=time.monotonic() - began,
     )
-    progress.end()
-    request = Request(tuple(without), unknown_term, seed)
-    return conclude(dataset, request, findings, time.monotonic() - began)
 
 
 def _select(

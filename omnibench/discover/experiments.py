@@ -159,21 +159,16 @@ class _Problem:
     def pruned(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
         """Counts without the runs that the wanted pairs can do without, the longest first."""
         while True:
-            fewer = np.array(list(self._with_fewer(counts)), dtype=np.intp).reshape(-1, len(counts))
-            if not len(fewer):
+            fewer = []
+            for index in np.flatnonzero(counts):
+                for left in (0, counts[index] - 1):
+                    if left == 0 or left >= _BATCHES[0]:
+                        fewer.append(counts.copy())
+                        fewer[-1][index] = left
+            cheapest = self._cheapest(np.array(fewer, dtype=np.intp).reshape(-1, len(counts)), wanted)
+            if cheapest is None:
                 return counts
-            enough = (self.sure(self.prospect(fewer)) | ~wanted).all(axis=(-2, -1))
-            if not enough.any():
-                return counts
-            counts = fewer[np.where(enough, self.cost(fewer), np.inf).argmin()]
-
-    def _with_fewer(self, counts: Counts) -> Iterator[Counts]:
-        for index in np.flatnonzero(counts):
-            for left in (0, counts[index] - 1):
-                if left == 0 or left >= _BATCHES[0]:
-                    fewer = counts.copy()
-                    fewer[index] = left
-                    yield fewer
+            counts = cheapest
 
     def exchanged(self, counts: Counts, wanted: NDArray[np.bool_]) -> Counts:
         """Counts with each command exchanged for runs of another one where that takes less time."""
@@ -185,12 +180,16 @@ class _Problem:
             others = np.concatenate([without + number * each for number in range(1, most)])
             often_enough = ((others == 0) | (others >= _BATCHES[0])).all(axis=1)
             others = others[often_enough & (self.cost(others) < self.cost(counts) - 1)]
-            if not len(others):
-                continue
-            enough = (self.sure(self.prospect(others)) | ~wanted).all(axis=(-2, -1))
-            if enough.any():
-                counts = others[np.where(enough, self.cost(others), np.inf).argmin()]
+            cheapest = self._cheapest(others, wanted)
+            counts = counts if cheapest is None else cheapest
         return counts
+
+    def _cheapest(self, options: Counts, wanted: NDArray[np.bool_]) -> Counts | None:
+        """The cheapest of some counts (n, C) that tell the wanted pairs apart; None if none of them does."""
+        if not len(options):
+            return None
+        enough = (self.sure(self.prospect(options)) | ~wanted).all(axis=(-2, -1))
+        return options[np.where(enough, self.cost(options), np.inf).argmin()] if enough.any() else None
 
 
 _DRAWS = 8  # draws of each member's values: half and twice as many change the minutes of omni3's plan by under 10 %
@@ -446,13 +445,6 @@ def _run(fit: Fit, timed: TimedCommand, heading: float | None) -> Trajectory:
     )
 
 
-def coarse(fit: Fit) -> Fit:
-    """The fit with a model at the sample period of the candidate runs."""
-    period = fit.model.sample_period
-    assert period is not None
-    return replace(fit, model=replace(fit.model, sample_period=max(period, _COARSE)))
-
-
 _WAYS = {0: "ahead", 90: "left", 180: "backward", 270: "right"}  # directions of travel, deg
 _SHORTEST_POSES = 0.02  # s between the reference poses that are simulated: denser ones take long and tell little more
 
@@ -563,11 +555,15 @@ def experiments_for(
     models: that the recordings cannot tell apart, with their weights.
     """
     experiments = []
+    groups = {group.name: group for _, model in reversed(models) for group in model.groups}
     for effect in effects:
+        names = (effect.name, *effect.confusable_with)
+        members = [groups[name] for name in names if name in groups]
+        model = next((each for _, each in models if any(group.name == effect.name for group in each.groups)), None)
         if effect.confusable_with and effect.stage == "actuator":
-            experiments.append(Experiment((effect.name, *effect.confusable_with), _OF_MOTORS, ""))
-        elif (rivals := _Rivals.of(effect, [model for _, model in models])) is not None:
-            experiments.append(_experiment(dataset, effects, effect, rivals))
+            experiments.append(Experiment(names, _OF_MOTORS, ""))
+        elif model is not None and len(members) > 1:
+            experiments.append(_experiment(dataset, effects, effect, model, members))
     return tuple(experiments)
 
 
@@ -575,60 +571,27 @@ def experiments_for(
 _OF_MOTORS = "Drive at other speeds, from rest to rest: what motors make of their targets depends on nothing else."
 
 
-@dataclass(frozen=True, eq=False)
-class _Rivals:
-    """The members of a class, and the model in which one of them is.
-
-    weight: of the class. others: effects of that model beside the member.
-    """
-
-    weight: float
-    model: Extended
-    others: tuple[Group, ...]
-    members: tuple[Group, ...]
-
-    @staticmethod
-    def of(effect: NamedEffect, models: Sequence[Extended]) -> _Rivals | None:
-        """The class of an effect; None where the models hold no other member."""
-        names = (effect.name, *effect.confusable_with)
-        groups = {group.name: group for model in reversed(models) for group in model.groups}
-        members = tuple(groups[name] for name in names if name in groups)
-        model = next((each for each in models if any(group.name == effect.name for group in each.groups)), None)
-        if model is None or len(members) < 2:
-            return None
-        return _Rivals(
-            effect.class_weight, model, tuple(group for group in model.groups if group.name != effect.name), members
-        )
-
-    @property
-    def groups(self) -> tuple[Group, ...]:
-        return (*self.others, *self.members)
-
-    @property
-    def separation(self) -> Separation:
-        """Expected separation of the members, by the recorded runs."""
-        fit = self.model.fit
-        recorded = fit.whitened(columns_of(fit, self.groups), self.model.residuals_without_effects)
-        return Separation(recorded, Members.of(fit.model.matrix, self.others, self.members), self.weight)
-
-    def of_runs(self, candidates: Sequence[CandidateRun]) -> Whitened:
-        """The columns of runs that could be driven."""
-        fit = at_runs(coarse(self.model.fit), [candidate.run for candidate in candidates])
-        columns = columns_of(fit, self.groups)
-        return fit.whitened(columns, [np.zeros(of_run.shape[:2]) for of_run in columns])
-
-
-def _experiment(dataset: Dataset, effects: Sequence[NamedEffect], effect: NamedEffect, rivals: _Rivals) -> Experiment:
-    fit = rivals.model.fit
-    candidates = candidate_runs(fit, [group.effect for group in rivals.members if group.effect is not None])
+def _experiment(
+    dataset: Dataset, effects: Sequence[NamedEffect], effect: NamedEffect, model: Extended, members: Sequence[Group]
+) -> Experiment:
+    """The experiment that tells the members of a class apart, of which the effect is one that a model holds."""
+    fit, others = model.fit, [group for group in model.groups if group.name != effect.name]
+    groups, period = [*others, *members], fit.model.sample_period
+    assert period is not None
+    recorded = fit.whitened(columns_of(fit, groups), model.residuals_without_effects)
+    separation = Separation(recorded, Members.of(fit.model.matrix, others, members), effect.class_weight)
+    # The columns of runs that could be driven, by the model at their sample period
+    candidates = candidate_runs(fit, [group.effect for group in members if group.effect is not None])
     seconds = np.array([candidate.seconds for candidate in candidates])
-    information = rivals.of_runs(candidates).information_of_runs
-    choice = choose_runs(
-        rivals.separation, information, seconds, float(np.mean([run.pose_times[-1] for run in fit.runs])) + PLACING
-    )
+    coarse = replace(fit, model=replace(fit.model, sample_period=max(period, _COARSE)))
+    driven = at_runs(coarse, [candidate.run for candidate in candidates])
+    columns = columns_of(driven, groups)
+    information = driven.whitened(columns, [np.zeros(of_run.shape[:2]) for of_run in columns]).information_of_runs
+    of_recorded = float(np.mean([run.pose_times[-1] for run in fit.runs])) + PLACING
+    choice = choose_runs(separation, information, seconds, of_recorded)
     chosen = [(candidates[index], int(choice.counts[index])) for index in np.flatnonzero(choice.counts)]
     runs, minutes = int(choice.counts.sum()), float(choice.counts @ seconds) / 60
-    names = [group.name for group in rivals.members]
+    names = [group.name for group in members]
     pairs = zip(*np.nonzero(np.triu(~choice.sure)), strict=True)
     inseparable = tuple((names[first], names[second]) for first, second in pairs)
     return Experiment(

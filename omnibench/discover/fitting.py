@@ -111,7 +111,11 @@ class Fit(fits.TrajectoryFit):
         They take no further evaluation of a model with effects, and have less encoder noise than differences over two
         samples, with which the class of the effect that omni3 lacks has a weight of 0.62 instead of 0.998.
         """
-        return [_velocities(log, poses) for log, poses in zip(self.logs, self.poses, strict=True)]
+        velocities = []
+        for log, poses in zip(self.logs, self.poses, strict=True):
+            stamps = np.append(min(0.0, log.stamps[0] - 1e-3), log.stamps)
+            velocities.append(np.gradient(np.vstack([log.start, poses]), stamps, axis=0)[1:])
+        return velocities
 
     @cached_property
     def weightings(self) -> list[InlierWhitener]:
@@ -164,12 +168,6 @@ class Fit(fits.TrajectoryFit):
         if not self.nuisances.estimated.any():
             return self
         return self.changed(nuisances=replace(self.nuisances, values=self.likeliest_nuisances(self.weightings)))
-
-
-def _velocities(log: WheelLog, poses: Array) -> Array:
-    stamps = np.append(min(0.0, log.stamps[0] - 1e-3), log.stamps)
-    velocities: Array = np.gradient(np.vstack([log.start, poses]), stamps, axis=0)[1:]
-    return velocities
 
 
 def first_fit(runs: Sequence[Trajectory], robot: Robot, sample_period: float, start: Array) -> Fit:

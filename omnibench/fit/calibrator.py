@@ -168,9 +168,12 @@ class RunResult(Brief):
     covariance_source: str = ""
 
 
+class _FlawError(Exception):
+    """An answer is no calibration; its text says why."""
+
+
 def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunResult:
     """Run a calibrator; whatever it raises becomes the outcome and reason of its result."""
-    answer: Any = None
     solution: Solution | None = None
     try:
         if refusal := refusal_of(calibrator, problem.robot, problem.trajectories):
@@ -178,13 +181,12 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         given: Any = calibrator.calibrate(problem)
         if not isinstance(given, Solution):
             raise PluginError(f"calibrate returned {type(given).__name__}, expected a Solution")
+        outcome, reason = Outcome.CONVERGED if given.converged else Outcome.BUDGET, one_line(str(given.reason))
         solution = given
-        outcome = Outcome.CONVERGED if solution.converged else Outcome.BUDGET
-        answer, reason = solution.vector, one_line(str(solution.reason))
     except BudgetSpent as spent:
         outcome, reason = Outcome(spent.kind), str(spent)
         if np.isfinite(problem.best_cost):
-            answer = problem.best_vector
+            solution = Solution(problem.best_vector, reason)
         else:
             outcome, reason = Outcome.INVALID, f"{reason}, and no candidate in the box had a finite cost"
     except OmnibenchError as error:
@@ -193,19 +195,15 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
     except (Exception, SystemExit) as error:  # whatever a plug-in raises is this run's outcome
         outcome, reason = Outcome.FAILED, describe_error(error)
     seconds = problem.seconds
-    vector, cost = None, None
-    freedom: Array | None = None
-    extension = solution.extension if isinstance(solution, Solution) else None
-    if outcome not in (Outcome.FAILED, Outcome.INVALID, Outcome.NOT_APPLICABLE):
+    vector, cost, freedom = None, None, None
+    if solution is not None:
         try:
-            if solution is not None and solution.degrees_of_freedom is not None:
-                freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
-            vector, cost, flaw = _examine(calibrator, problem, answer, freedom, extension)
-            if flaw:
-                outcome, reason = Outcome.INVALID, flaw
+            vector, cost, freedom = _examined(calibrator, problem, solution)
+        except _FlawError as flaw:
+            outcome, reason = Outcome.INVALID, str(flaw)
         except Exception as error:  # a cost may be a plug-in's, too
             outcome, reason = Outcome.FAILED, describe_error(error)
-    estimate = solution if vector is not None else None
+    estimate = solution if solution is not None and vector is not None else Solution(problem.start, "none")
     return RunResult(
         outcome=outcome,
         reason=reason,
@@ -217,12 +215,44 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
         history=tuple(problem.history),
         at_bounds=problem.at_bounds(vector) if vector is not None and calibrator.bounded else (),
         held=problem.held if calibrator.bounded else (),
-        covariance=estimate.covariance if estimate is not None else None,
-        noise=estimate.noise if estimate is not None else None,
-        degrees_of_freedom=freedom if estimate is not None else None,
-        extension=estimate.extension if estimate is not None else None,
-        covariance_source=estimate.covariance_source if estimate is not None else "",
+        covariance=estimate.covariance,
+        noise=estimate.noise,
+        degrees_of_freedom=freedom,
+        extension=estimate.extension,
+        covariance_source=estimate.covariance_source,
     )
+
+
+def _examined(
+    calibrator: Calibrator, problem: CalibrationProblem, solution: Solution
+) -> tuple[Array, float, Array | None]:
+    """The answer as a vector (n,), its cost, and its variances' degrees of freedom (n,). _FlawError: it has one."""
+    freedom = None
+    if solution.degrees_of_freedom is not None:
+        freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
+    try:
+        vector = np.array(solution.vector, dtype=float)
+    except (TypeError, ValueError):
+        raise _FlawError("the answer is not a vector of numbers") from None
+    if vector.shape != problem.start.shape:
+        raise _FlawError(f"the answer has shape {vector.shape}, expected ({problem.size},)")
+    if not np.isfinite(vector).all():
+        raise _FlawError("the answer holds NaN or infinity")
+    if calibrator.bounded and not problem.inside(vector[None])[0]:
+        outside = np.array(problem.names)[(vector < problem.lower) | (vector > problem.upper)]
+        raise _FlawError(f"the answer is outside the box ({', '.join(outside)})")
+    if freedom is not None and not (freedom > 0).all():
+        raise _FlawError(f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}")
+    if flaw := saved.matrix_flaw(problem.matrix(vector)):
+        raise _FlawError(f"the answer's matrix holds {flaw}")
+    if solution.extension is None:
+        cost = float(problem.values(vector[None])[0])
+    else:
+        model = model_of_answer(problem, problem.matrix(vector), solution.extension)
+        cost = problem.objective.of_model(model, problem.trajectories)
+    if not np.isfinite(cost):
+        raise _FlawError("the answer's cost is not finite")
+    return vector, cost, freedom
 
 
 def refusal_of(calibrator: Calibrator, robot: Robot, runs: Sequence[Trajectory]) -> str:
@@ -296,40 +326,3 @@ def unloadable(failure: PluginFailure) -> type[Calibrator]:
             raise PluginError(f"{failure.origin} cannot be imported: {failure.error}")
 
     return Unloadable
-
-
-def _examine(
-    calibrator: Calibrator,
-    problem: CalibrationProblem,
-    answer: Any,
-    freedom: Array | None,
-    extension: saved.ModelExtension | None,
-) -> tuple[Array | None, float | None, str]:
-    """The answer as a vector (n,), its cost, and its flaw in words; vector and cost are None if there is a flaw."""
-    try:
-        vector = np.array(answer, dtype=float)
-    except (TypeError, ValueError):
-        return None, None, "the answer is not a vector of numbers"
-    if vector.shape != problem.start.shape:
-        return None, None, f"the answer has shape {vector.shape}, expected ({problem.size},)"
-    if not np.isfinite(vector).all():
-        return None, None, "the answer holds NaN or infinity"
-    if calibrator.bounded and not problem.inside(vector[None])[0]:
-        outside = [
-            name
-            for name, value, low, high in zip(problem.names, vector, problem.lower, problem.upper, strict=True)
-            if not low <= value <= high
-        ]
-        return None, None, f"the answer is outside the box ({', '.join(outside)})"
-    if freedom is not None and not (freedom > 0).all():
-        return None, None, f"degrees_of_freedom of the answer's variances must be above 0, found {freedom.min():g}"
-    if flaw := saved.matrix_flaw(problem.matrix(vector)):
-        return None, None, f"the answer's matrix holds {flaw}"
-    if extension is None:
-        cost = float(problem.values(vector[None])[0])
-    else:
-        model = model_of_answer(problem, problem.matrix(vector), extension)
-        cost = problem.objective.of_model(model, problem.trajectories)
-    if not np.isfinite(cost):
-        return None, None, "the answer's cost is not finite"
-    return vector, cost, ""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from operator import itemgetter
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError, DataError, require_choice, require_range, require_type
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.evaluator import ElementBox, cut, impulses, make_path, quadrature
+from omnibench.fit.evaluator import ElementBox, impulses, make_path, quadrature
 from omnibench.fit.parameterisation import Box, BoxName, ExplicitBox, MatrixElements
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice
@@ -108,15 +108,8 @@ class StampSums:
         if nodes is None:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
         self._quadrature = QUADRATURE if integration == "arc" else 0.0
-        columns = partial(
-            _columns_of,
-            design=problem.start.reshape(3, -1),
-            fitted=fitted,
-            row=row,
-            integration=integration,
-            nodes=nodes,
-        )
-        self._runs = EachLog(columns, logs)
+        design = problem.start.reshape(3, -1)
+        self._runs = EachLog(partial(_columns_of, design, fitted, integration, nodes), logs)
         self.curvature = np.concatenate([run.curvature for run in self._runs])
         reaches = [
             ((np.abs(path.angles) @ speed).sum(), (np.abs(path.before) @ row).max(initial=0.0)) for path in paths
@@ -181,17 +174,13 @@ class _RunColumns:
         return np.cumsum(between, axis=0)
 
 
-def _columns_of(
-    log: WheelLog, design: Array, fitted: Array, row: Array, integration: Integration, nodes: int
-) -> _RunColumns:
-    """The impulses of a run. row: the largest magnitudes of row 3. Else as in StampSums."""
+def _columns_of(design: Array, fitted: Array, integration: Integration, nodes: int, log: WheelLog) -> _RunColumns:
+    """The impulses of a run, see StampSums."""
     path = make_path(log, integration)
     nothing = np.zeros((1, design.shape[1]))
-    (whole,) = cut(path, row, np.inf)
     # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
     angles, before = (
-        np.vstack([np.reshape(part, (-1, design.shape[1])), nothing])
-        for part in impulses(path, whole, integration, nodes)
+        np.vstack([np.reshape(part, (-1, design.shape[1])), nothing]) for part in impulses(path, integration, nodes)
     )
     moved, along, turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
     sources = np.column_stack([moved.real, moved.imag, along])
@@ -200,16 +189,9 @@ def _columns_of(
     return _RunColumns(columns, before @ design[2] + float(log.start[2]), turns, path.ends * nodes, sizes)
 
 
-class Minimum(NamedTuple):
-    """An approximate minimiser (n,) of Eq. (D1) and its directions (S, k), Eq. (D3)."""
-
-    point: Array
-    directions: Array
-
-
 def least_sum_of_norms(
     residuals: Array, jacobian: Array, shares: Array, lower: Array, upper: Array, begin: Array
-) -> Minimum:
+) -> tuple[Array, Array]:
     """Minimum over v (n,) in a box of a sum of norms, with the vectors u_s of the best bound, its dual solution.
 
     The bound holds for any u_s; the best are u_s = e_s / |e_s| at the minimiser of the sum of norms
@@ -228,7 +210,8 @@ def least_sum_of_norms(
 
     solve its normal equations exactly, so that they are balanced even where residuals vanish.
 
-    residuals (S, k), jacobian (S, k, n), shares (S,), lower, upper and begin (n,).
+    residuals (S, k), jacobian (S, k, n), shares (S,), lower, upper and begin (n,). Returns an approximate
+    minimiser (n,) and its directions (S, k).
     """
     free = (upper > lower) & (np.abs(jacobian).max(axis=(0, 1)) > 0)
     point = np.clip(begin, lower, upper)
@@ -252,7 +235,7 @@ def least_sum_of_norms(
         errors = fixed + moving @ point[free]
         if settled:
             break
-    return Minimum(point, errors * weights[:, None])  # Eq. (D3)
+    return point, errors * weights[:, None]  # Eq. (D3)
 
 
 def into_unit_ball(directions: Array) -> tuple[Array, Array, Array]:
@@ -337,17 +320,12 @@ class LowerBounds:
     def __init__(self, problem: CalibrationProblem) -> None:
         parameterisation, objective = problem.parameterisation, problem.objective
         if not isinstance(parameterisation, MatrixElements):
-            raise ConfigError(
-                "a lower bound needs the matrix parameterisation; its box contains what a geometry can do"
-            )
+            raise ConfigError("a lower bound needs the matrix parameterisation; its box holds what a geometry can do")
         if not isinstance(objective, SumOfNorms):
             raise ConfigError(f"a lower bound needs a cost that is a sum of norms, which {objective.name} is not")
         odometry = problem.odometry
         if not isinstance(odometry, OdometryBatch):
-            raise ConfigError(
-                "a lower bound is proven for reference poses alone; of runs with distances, turns and other references "
-                "no bound is known, and their calibration cannot be certified"
-            )
+            raise ConfigError("a lower bound needs reference poses alone: of other references none is known")
         self._design = problem.start.reshape(3, -1)
         # Orthonormal directions (r, N) of wheel rates across the null ones, the unit vectors if there are none.
         null, unit = parameterisation.null, np.eye(self._design.shape[1])
@@ -416,7 +394,7 @@ class LowerBounds:
         bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(directions)]
         bound, looseness = max(bounds, key=itemgetter(0))
         if self._weights[2] and bound <= proven:
-            turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box).directions
+            _, turns = least_sum_of_norms(residuals[:, 2:], jacobian[:, 2:], self._shares, *box)
             headings = np.column_stack([np.zeros((len(turns), 2)), turns])
             bounds = [self._dual_bound(part, sums, slopes, scaled) for scaled in into_unit_ball(headings)]
             proven = max(proven, *(by_headings for by_headings, _ in bounds))
@@ -524,10 +502,8 @@ def certify_optimum(
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
     provenance = calibration.provenance
     if provenance is not None and provenance.loss is not None:
-        raise DataError(
-            f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}, and a bound is proven for a "
-            "cost without one; certify a calibration that was fitted without --loss"
-        )
+        fitted = f"calibration {calibration.name!r} was fitted with the loss {provenance.loss}"
+        raise DataError(f"{fitted}, of which no bound is known; certify one that was fitted without --loss")
     settings = CompleteSettings(
         calibrator="closed_form",
         cost=CostChoice(name=provenance.cost) if provenance else CostChoice(),
@@ -547,9 +523,7 @@ def certify_optimum(
     if calibration.effects or weighed:
         optimum = run_calibrator(calibrators.create(settings.calibrator), problem)
         if optimum.vector is None or optimum.cost is None:
-            raise DataError(
-                f"calibration {calibration.name!r}: the optimum of the matrix alone is not found: {optimum.reason}"
-            )
+            raise DataError(f"{calibration.name!r}: the optimum of the matrix alone is not found: {optimum.reason}")
         if optimum.cost > problem.objective.rounding:  # no share of rounding means anything
             vector, inside, shrinking, cost = optimum.vector, True, cost / optimum.cost - 1, optimum.cost
     began = time.perf_counter()
@@ -558,7 +532,15 @@ def certify_optimum(
         watch(event)
         if event.done == _TIMED and (parts or math.inf) > _TIMED and gap > 0:  # to a gap of 0 the limits end it
             of_part = (time.perf_counter() - began) / _TIMED
-            watch(Progress("duration", result=_duration_in_words(gap, of_part, seconds, parts)))
+            growth = 2 ** math.log10(_PARTS_GAP / gap)
+            about, least, most = (growth * number for number in (_PARTS, _FEW_PARTS, _MANY_PARTS))
+            words = (
+                f"a proof to within {gap:.3g} of the cost takes about {of_part * about:.2g} s here "
+                f"({of_part * least:.2g} to {of_part * most:.2g} s: {least:.0f} to {most:.0f} parts at {of_part:.2g} s)"
+            )
+            limits = [f"{seconds:g} s"] * math.isfinite(seconds) + [f"{parts} parts"] * (parts is not None)
+            words += f"; it ends after {' or '.join(limits)} at the latest" if limits else ""
+            watch(Progress("duration", result=words))
 
     known = vector if inside else problem.start
     proof = prove(problem, known, gap=gap, seconds=seconds, parts=parts, watch=foretell, backend=backend)
@@ -619,32 +601,23 @@ def prove(
             watch(Progress("proof", count, None, "part", best_cost, f"bound {proven:.6f}"))
             if finished or spent > seconds or count >= (parts or math.inf):
                 return proof
-            if backend is None:
-                cut, made = [*bounds.split(heapq.heappop(boxes)[2])], 2
-            else:
-                cut, made = _cut_at_once(boxes, bounds, (1 - gap) * best_cost, (parts or math.inf) - count, backend)
-            for part in cut:
-                vector = bounds.vector(part.good)
-                if problem.inside(vector[None])[0] and (cost := float(problem.values(vector[None])[0])) < best_cost:
-                    best_cost, best_vector = cost, vector
-                order += 1
-                heapq.heappush(boxes, (part.bound, order, part))  # order breaks ties: nodes cannot be compared
-            count += made
-
-
-def _cut_at_once(
-    boxes: list[tuple[float, int, Node]], bounds: LowerBounds, enough: float, allowed: float, backend: Backend
-) -> tuple[list[Node], int]:
-    """Take the lowest parts and cut each as a job: the parts that they become, and how many were bounded for that.
-
-    enough: bound from which on a part needs no cut. allowed: parts that may still be bounded.
-    """
-    lowest = [heapq.heappop(boxes)[2]]
-    while boxes and len(lowest) < _AT_ONCE and boxes[0][0] < enough and boxes[0][2].looseness.any():
-        lowest.append(heapq.heappop(boxes)[2])
-    cuts = _CUTS if math.isinf(allowed) else int(min(_CUTS, max(allowed // (2 * len(lowest)), 1)))
-    branches = gathered(backend, _branch, [(bounds, node, enough, cuts) for node in lowest], shared=(bounds,))
-    return [node for nodes, _ in branches for node in nodes], sum(made for _, made in branches)
+            # Cut the part with the lowest bound; several at once, and each several times, where a backend takes jobs.
+            together, cuts = (1, 1) if backend is None else (_AT_ONCE, _CUTS)
+            enough = (1 - gap) * best_cost
+            nodes = [heapq.heappop(boxes)[2]]
+            while boxes and len(nodes) < together and boxes[0][0] < enough and boxes[0][2].looseness.any():
+                nodes.append(heapq.heappop(boxes)[2])
+            if parts:
+                cuts = min(cuts, max((parts - count) // (2 * len(nodes)), 1))
+            orders = [(bounds, node, enough, cuts) for node in nodes]
+            for halves, made in gathered(backend, _branch, orders, shared=(bounds,)):
+                count += made
+                for part in halves:
+                    vector = bounds.vector(part.good)
+                    if problem.inside(vector[None])[0] and (cost := float(problem.values(vector[None])[0])) < best_cost:
+                        best_cost, best_vector = cost, vector
+                    order += 1
+                    heapq.heappush(boxes, (part.bound, order, part))  # order breaks ties: nodes cannot be compared
 
 
 def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> tuple[list[Node], int]:
@@ -654,20 +627,8 @@ def _branch(order: tuple[LowerBounds, Node, float, int], _: Reporter) -> tuple[l
     """
     bounds, node, enough, cuts = order
     boxes, made = [(node.bound, 0, node)], 0
-    while made < 2 * cuts and boxes[0][0] < enough and boxes[0][2].looseness.any():
+    while not made or (made < 2 * cuts and boxes[0][0] < enough and boxes[0][2].looseness.any()):
         for part in bounds.split(heapq.heappop(boxes)[2]):
             made += 1
             heapq.heappush(boxes, (part.bound, made, part))
     return [part for _, _, part in boxes], made
-
-
-def _duration_in_words(gap: float, of_part: float, seconds: float, parts: int | None) -> str:
-    """Duration of a proof that examines a part in ``of_part`` s, and when it ends at the latest, in words."""
-    growth = 2 ** math.log10(_PARTS_GAP / gap)
-    about, least, most = (growth * number for number in (_PARTS, _FEW_PARTS, _MANY_PARTS))
-    limits = [f"{seconds:g} s"] * math.isfinite(seconds) + [f"{parts} parts"] * (parts is not None)
-    words = (
-        f"a proof to within {gap:.3g} of the cost takes about {of_part * about:.2g} s here ({of_part * least:.2g} to "
-        f"{of_part * most:.2g} s: {least:.0f} to {most:.0f} parts at {of_part:.2g} s)"
-    )
-    return f"{words}; it ends after {' or '.join(limits)} at the latest" if limits else words

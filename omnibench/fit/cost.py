@@ -27,12 +27,14 @@ class Cost(ABC):
     stamps: where along a trajectory poses are compared, ``final`` (last reference pose) or ``reference`` (all after the
     start). Of a run with references other than poses all of these count, too, each with the coordinates that it has.
     rounding: in the cost's unit; one that is not above it is rounding, of which no share means anything.
+    coordinates: factors of the errors of x, y and heading; 0 of those that do not count.
     """
 
     Options: ClassVar[type[Options]] = Options
     name: str
     stamps: Literal["final", "reference"] = "final"
     rounding: float = 0.0
+    coordinates: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __init__(self, options: Any) -> None:
         self.options = options
@@ -68,11 +70,6 @@ class Cost(ABC):
             return None
         return reference_rows(trajectories, self.stamps, self.coordinates, self.name)
 
-    @property
-    def coordinates(self) -> tuple[float, float, float]:
-        """Factors of the errors of x, y and heading; 0 of those that do not count."""
-        return (1.0, 1.0, 1.0)
-
     def logs(self, trajectories: Sequence[Trajectory]) -> list[WheelLog]:
         """The wheel logs of the trajectories with this cost's stamps. DataError: one has no pose after its start."""
         for run in trajectories if self.stamps == "reference" else ():
@@ -105,10 +102,9 @@ class SumOfNorms(Cost):
     weights: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
     rounding = NO_ERROR
 
-    @property
-    def coordinates(self) -> tuple[float, float, float]:
-        """The weights."""
-        return self.weights
+    def __init__(self, options: Any) -> None:
+        super().__init__(options)
+        self.coordinates = self.weights
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,): the norms, weighted by the stamps' shares."""

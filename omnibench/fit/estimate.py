@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import median_period
 from omnibench.errors import ConfigError, DataError
-from omnibench.fit.loss import Loss, LossName, Squares, make_loss
+from omnibench.fit.loss import Loss, LossName, make_loss
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.registry import effects
@@ -216,7 +216,7 @@ def estimate(
     may_go_on: asked before each step but the first, with the number of those that were made. near: where the steps
     begin, in the place of the design.
     """
-    rows, loss = _Rows(problem), make_loss(problem.loss, 3) or Squares(3)
+    rows, loss = _Rows(problem), make_loss(problem.loss, 3)
     unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
     if near is not None:
         common = min(len(unknowns), len(near.unknowns)) if near.root.shape[0] == problem.size else problem.root.shape[1]

@@ -19,7 +19,9 @@ each part of them.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import product
 from math import comb, factorial
@@ -27,7 +29,8 @@ from math import comb, factorial
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.fit.parameterisation import MatrixElements, Parameterisation, ParameterisationName
+from omnibench.fit.geometry import Parameterisation
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.processes import one_thread
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Complex, Integration, OdometryBatch, WheelLog
@@ -80,13 +83,16 @@ class ElementBox:
     upper: Array
 
     @classmethod
-    def of(cls, parameterisation: Parameterisation | DrivenFrame, lower: Array, upper: Array) -> ElementBox:
-        """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,).
+    def of(
+        cls, parameterisation: Parameterisation, lower: Array, upper: Array, frame: DrivenFrame | None = None
+    ) -> ElementBox:
+        """The box around the matrices of all vectors between ``lower`` and ``upper`` (n,), in a frame if there is one.
 
         It holds all of them where the matrix is linear in the vector, and nearly all where it is curved.
         """
         middle, half = (lower + upper) / 2, (upper - lower) / 2
-        centre, *moved = parameterisation.matrices(middle + np.vstack([np.zeros(len(half)), np.diag(half)]))
+        matrices = parameterisation.matrices(middle + np.vstack([np.zeros(len(half)), np.diag(half)]))
+        centre, *moved = matrices if frame is None else frame.seen(matrices)
         reach: Array = np.abs(np.array(moved) - centre).sum(axis=0)
         reach *= 1 + (_WIDENED[0] if parameterisation.name == "matrix" else _MARGIN)
         slack = _WIDENED[1] * np.abs(centre).max(axis=1, keepdims=True)
@@ -128,24 +134,8 @@ class DrivenFrame:
     should be. driven: Q. design: K0 (3, M).
     """
 
-    searched: MatrixElements
     driven: Array
     design: Array
-
-    @classmethod
-    def of(cls, searched: MatrixElements) -> DrivenFrame:
-        """The frame of the directions along which a parameterisation does not keep the design."""
-        signals = searched.null.shape[1]
-        _, _, directions = np.linalg.svd(np.vstack([searched.null, np.zeros((signals, signals))]))
-        return cls(searched, directions[len(searched.null) :], searched.robot.inverse_kinematic_matrix)
-
-    @property
-    def name(self) -> ParameterisationName:
-        return self.searched.name
-
-    def matrices(self, vectors: Array) -> Array:
-        """Matrices (P, 3, r + 3) of vectors (P, n)."""
-        return self.seen(self.searched.matrices(vectors))
 
     def seen(self, matrices: Array) -> Array:
         """Matrices (P, 3, M) in the frame, (P, 3, r + 3)."""
@@ -174,15 +164,6 @@ class Path:
     before: Array
     ends: NDArray[np.intp]
     driven: Array
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Pieces ``first`` to ``last`` (not included) of a path; ``anchor`` (N,): wheel angles that headings are about."""
-
-    first: int
-    last: int
-    anchor: Array
 
 
 def make_path(log: WheelLog, integration: Integration) -> Path:
@@ -227,32 +208,32 @@ def quadrature(
     return None
 
 
-def cut(path: Path, reach: Array, limit: float) -> list[Segment]:
+def cut(path: Path, reach: Array, limit: float) -> tuple[NDArray[np.intp], Array]:
     """Segments in which the box turns headings about the anchor's by at most ``limit``, rad.
 
-    reach (N,): half-width of row 3's box. An infinite limit leaves the path whole, anchored at its start.
+    reach (N,): half-width of row 3's box. An infinite limit leaves the path whole, anchored at its start. Returns edges
+    (G + 1,): the first piece of each segment, and the number of pieces; and the anchors (G, N): wheel angles.
     """
     count, wheels = path.angles.shape
     if np.isinf(limit):
-        return [Segment(0, count, np.zeros(wheels))]
-    segments = []
-    first = 0
-    while first < count:
-        window = slice(first, first + _LONGEST_SEGMENT)
+        return np.array([0, count]), np.zeros((1, wheels))
+    edges, anchors = [0], []
+    while edges[-1] < count:
+        window = slice(edges[-1], edges[-1] + _LONGEST_SEGMENT)
         begin, end = path.before[window], path.before[window] + path.angles[window]
         low = np.minimum.accumulate(np.minimum(begin, end))
         high = np.maximum.accumulate(np.maximum(begin, end))
-        fitting = int(np.searchsorted((high - low) @ reach / 2 > limit, True))
-        length = max(1, fitting)
-        segments.append(Segment(first, first + length, (low[length - 1] + high[length - 1]) / 2))
-        first += length
-    return segments
+        length = max(1, int(np.searchsorted((high - low) @ reach / 2 > limit, True)))
+        edges.append(edges[-1] + length)
+        anchors.append((low[length - 1] + high[length - 1]) / 2)
+    return np.array(edges), np.array(anchors)
 
 
-def impulses(path: Path, segment: Segment, integration: Integration, nodes: int) -> tuple[Array, Array]:
-    """Impulses (n, q, N) of a segment's pieces and the wheel angles (n, q, N) of their headings about the anchor."""
-    angles = path.angles[segment.first : segment.last, None, :]
-    before = path.before[segment.first : segment.last, None, :] - segment.anchor
+def impulses(
+    path: Path, integration: Integration, nodes: int, pieces: slice = slice(None), anchor: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Impulses (n, q, N) of some pieces and the wheel angles (n, q, N) of their headings about the anchor (N,)."""
+    angles, before = path.angles[pieces, None, :], path.before[pieces, None, :] - anchor
     if integration == "euler":
         return angles, before
     place, weight = np.polynomial.legendre.leggauss(nodes)  # on [-1, 1]
@@ -274,35 +255,22 @@ class Basis:
     degree: int
     orders: NDArray[np.intp]
 
-    @classmethod
-    def make(cls, degree: int, free: NDArray[np.bool_]) -> Basis:
-        """All products of total degree ``degree`` or less in the free wheels (N,)."""
-        ranges = (range(degree + 1) if wheel else range(1) for wheel in free)
-        return cls(degree, np.array([orders for orders in product(*ranges) if sum(orders) <= degree], dtype=np.intp))
-
     def values(self, places: Array) -> Array:
         """The products (n, P) at places (P, N) in [-1, 1]."""
         angle = np.arccos(np.clip(places.T, -1.0, 1.0))
-        polynomials = np.cos(angle[:, None, :] * np.arange(self.degree + 1)[:, None])  # (N, D + 1, P)
-        first, *others = self.orders.T
-        values: Array = polynomials[0][first]
-        for wheel, orders in enumerate(others, 1):
-            values *= polynomials[wheel][orders]
-        return values
+        return self._products(np.cos(angle[:, None, :] * np.arange(self.degree + 1)[:, None]))
 
     def coefficients(self, angles: Array) -> Array:
         """Coefficients (n, M) of exp(i sum_j z_j d_j) for z = angles (M, N), each to be times i^(total degree)."""
-        factors = _bessel(angles.T, self.degree)  # (N, D + 1, M)
+        return self._products(_bessel(angles.T, self.degree))
+
+    def _products(self, factors: Array) -> Array:
+        """Products (n, P) of each wheel's factor (N, degree + 1, P) of its order."""
         first, *others = self.orders.T
         values: Array = factors[0][first]
         for wheel, orders in enumerate(others, 1):
             values *= factors[wheel][orders]
         return values
-
-    @property
-    def quarter_turns(self) -> NDArray[np.intp]:
-        """Total degree (n,) modulo 4: the power of i that belongs to each term."""
-        return np.asarray(self.orders.sum(axis=1) % 4)
 
 
 def degree_for(
@@ -319,16 +287,14 @@ def degree_for(
     """
     if zeta.max(initial=0.0) > _LARGEST_ANGLE:
         return None, 0.0
-    half, power = zeta / 2, steps * (2.0**wheels * np.exp(zeta / 2))
-    degree = -1
-    while True:
-        degree += 1
-        if comb(degree + wheels, wheels) > _MOST_TERMS:
-            return None, 0.0
+    half, power, degree = zeta / 2, steps * (2.0**wheels * np.exp(zeta / 2)), 0
+    while comb(degree + wheels, wheels) <= _MOST_TERMS:
         power = power * half / (degree + 1)
         neglected = float(np.add.reduceat(power, firsts).max())
         if neglected <= tolerance:
             return degree, neglected
+        degree += 1
+    return None, 0.0
 
 
 def _bessel(angles: Array, degree: int) -> Array:
@@ -368,32 +334,22 @@ def _power_series(order: int, square: Array) -> Array:
 class ExpansionPlan:
     """Logs cut into segments, the basis of their expansion, and bounds of what is neglected.
 
-    paths, segments: one for each log. nodes: number of quadrature nodes within a piece. free (N,): wheels whose element
-    of row 3 has a width in the box. error: bound of truncation and quadrature, m. spare: what the decomposition may
-    neglect in a row, m. A row is a place on a path where a displacement is wanted: a stamp, or the start of the next
-    segment.
+    paths, segments: one for each log, see ``cut``. nodes: number of quadrature nodes within a piece. free (N,): wheels
+    whose element of row 3 has a width in the box. error: bound of truncation and quadrature, m. spare: what the
+    decomposition may neglect in a row, m. A row is a place on a path where a displacement is wanted: a stamp, or the
+    start of the next segment.
     """
 
     logs: Sequence[WheelLog]
     box: ElementBox
     integration: Integration
     paths: list[Path]
-    segments: list[list[Segment]]
+    segments: list[tuple[NDArray[np.intp], Array]]
     nodes: int
     basis: Basis
     free: NDArray[np.bool_]
     error: float
     spare: float
-
-    def row_ends(self, index: int) -> list[tuple[Segment, list[int]]]:
-        """The segments of a path, each with the number of pieces up to each of its rows."""
-        path, segments = self.paths[index], self.segments[index]
-        rows = []
-        for number, segment in enumerate(segments, 1):
-            stamps = path.ends[(path.ends > segment.first) & (path.ends <= segment.last)]
-            onward = [segment.last] if number < len(segments) else []
-            rows.append((segment, sorted({*stamps.tolist(), *onward})))
-        return rows
 
 
 def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBox) -> ExpansionPlan | None:
@@ -402,28 +358,26 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
         return None
     paths = [make_path(log, integration) for log in logs]
     row, speed = box.largest[2], box.speed
-    lengths = [float((np.abs(path.angles) @ speed).sum()) for path in paths]
-    length = max(1.0, *lengths)
+    steps_of = [np.abs(path.angles) @ speed for path in paths]
+    length = max(1.0, *(float(of_path.sum()) for of_path in steps_of))
     nodes = quadrature(paths, row, speed, _QUADRATURE * length, integration)
     if nodes is None:
         return None
     free = box.reach[2] > _NO_WIDTH * np.abs(box.centre[2]).max()
     wheels = int(free.sum())
-    steps = np.concatenate([np.abs(path.angles) @ speed for path in paths])
-    firsts = np.cumsum([0, *(len(path.angles) for path in paths[:-1])])
+    steps, firsts = np.concatenate(steps_of), np.cumsum([0, *map(len, steps_of[:-1])])
     cheapest, chosen = _SAMPLE * len(steps), None
     for limit in _LIMITS:
         segments = [cut(path, box.reach[2], limit) for path in paths]
         turns = []  # the most (n,) that the box turns the heading of each piece about its anchor, rad
-        for path, parts in zip(paths, segments, strict=True):
-            anchors = np.repeat([part.anchor for part in parts], [part.last - part.first for part in parts], axis=0)
-            begin = path.before - anchors
+        for path, (edges, anchors) in zip(paths, segments, strict=True):
+            begin = path.before - np.repeat(anchors, np.diff(edges), axis=0)
             turns.append(np.maximum(np.abs(begin), np.abs(begin + path.angles)) @ box.reach[2])
         zeta = np.concatenate(turns)
         degree, neglected = degree_for(zeta, steps, firsts, _TRUNCATION * length, wheels)
         if degree is None:
             continue
-        terms, count = comb(degree + wheels, wheels), sum(map(len, segments))
+        terms, count = comb(degree + wheels, wheels), sum(len(anchors) for _, anchors in segments)
         rows = max(sum(len(path.ends) for path in paths), count)
         rank = min(float(terms), _RANK * terms**_POWER)
         values = 2 * len(row) * rows * rank
@@ -434,68 +388,10 @@ def make_plan(logs: Sequence[WheelLog], integration: Integration, box: ElementBo
         return None
     segments, degree, neglected = chosen
     error = _QUADRATURE * length * (nodes > 1) + neglected
-    spare = _DECOMPOSITION * length / max(map(len, segments))
-    basis = Basis.make(degree, free)
-    return ExpansionPlan(logs, box, integration, paths, segments, nodes, basis, free, error, spare)
-
-
-@dataclass(frozen=True, eq=False)
-class PartedEvaluator:
-    """Poses at the stamps of many logs, as PoseEvaluator gives them, by the evaluators of parts of the logs."""
-
-    parts: Sequence[PoseEvaluator]
-
-    def covers(self, matrices: Array) -> NDArray[np.bool_]:
-        """True (P,) for the matrices (P, 3, N) that lie in the box."""
-        return self.parts[0].covers(matrices)
-
-    def poses(self, matrices: Array) -> Array:
-        """Poses (P, S, 3) of matrices (P, 3, N) in the box, see PoseEvaluator."""
-        return np.concatenate([part.poses(matrices) for part in self.parts], axis=1)
-
-
-def evaluator_of_runs(
-    logs: Sequence[WheelLog], integration: Integration, box: ElementBox, frame: DrivenFrame | None
-) -> PoseEvaluator | PartedEvaluator | None:
-    """The evaluator of logs for matrices in a box; None where direct integration is faster. frame: of the matrices."""
-    parts = []
-    for part in parts_of(logs):
-        seen = part if frame is None else frame.logs(part)
-        evaluator = make_evaluator(OdometryBatch(seen, integration), seen, integration, box)
-        if evaluator is None:
-            return None
-        parts.append(evaluator)
-    return parts[0] if len(parts) == 1 else PartedEvaluator(parts)
-
-
-def moments_of(plan: ExpansionPlan) -> Array:
-    """Coefficients (R, n, 2N) of the regressors at the R rows of all logs: real parts of the N wheels, then imaginary.
-
-    n: terms of the plan's basis.
-    """
-    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
-    quarter_turns = plan.basis.quarter_turns[:, None]
-    moments = []
-    for index, (path, log) in enumerate(zip(plan.paths, plan.logs, strict=True)):
-        rows = []  # sums (n, 2N) of cosines and sines up to each row
-        for segment, ends in plan.row_ends(index):
-            angles, about = impulses(path, segment, plan.integration, plan.nodes)
-            heading = about @ centre + log.start[2]
-            sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
-            wheels = about.shape[2]
-            coefficients = plan.basis.coefficients(about.reshape(-1, wheels) * reach)
-            total = 0.0
-            for first, last in zip([segment.first, *ends[:-1]], ends, strict=True):
-                pieces = slice(first - segment.first, last - segment.first)
-                summed = slice(pieces.start * plan.nodes, pieces.stop * plan.nodes)
-                total = total + coefficients[:, summed] @ sources[pieces].reshape(-1, 2 * wheels)
-                rows.append(total)
-        # Each term is to be times i^(total degree), Eq. (5).
-        cosine, sine = np.split(np.array(rows), 2, axis=2)
-        real = np.choose(quarter_turns, [cosine, -sine, -cosine, sine])
-        imaginary = np.choose(quarter_turns, [sine, cosine, -sine, -cosine])
-        moments.append(np.concatenate([real, imaginary], axis=2))
-    return np.concatenate(moments)
+    spare = _DECOMPOSITION * length / max(len(anchors) for _, anchors in segments)
+    ranges = (range(degree + 1) if wheel else range(1) for wheel in free)
+    orders = np.array([orders for orders in product(*ranges) if sum(orders) <= degree], dtype=np.intp)
+    return ExpansionPlan(logs, box, integration, paths, segments, nodes, Basis(degree, orders), free, error, spare)
 
 
 def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
@@ -513,131 +409,105 @@ def compress(moments: Array, plan: ExpansionPlan) -> tuple[Array, float]:
         residual = np.abs(scaled - (scaled @ used.T) @ used).sum(axis=1).reshape(rows, 2, components // 2)
         return float(np.hypot(residual[:, 0], residual[:, 1]).sum(axis=1).max())
 
-    low, high = 0, len(directions)
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if neglected(middle) <= plan.spare else (middle + 1, high)
-    return directions[:low].T, neglected(low) * max(map(len, plan.segments))
-
-
-@dataclass(frozen=True, eq=False)
-class SegmentJoin:
-    """Indices that join the rows of G segments to the S stamps.
-
-    row_of_stamp, log_of_stamp (S,). segment_of_row (R,). anchors (G, N): wheel angles of the segments' anchors, rad.
-    last_row, first_of_log (G,): the row at a segment's end, and the first segment of its log.
-    """
-
-    row_of_stamp: NDArray[np.intp]
-    log_of_stamp: NDArray[np.intp]
-    segment_of_row: NDArray[np.intp]
-    anchors: Array
-    last_row: NDArray[np.intp]
-    first_of_log: NDArray[np.intp]
-
-    def positions(self, displacements: Array, matrices: Array) -> Array:
-        """x and y (P, 2, S) relative to the start, m, from displacements (P, 2, R) within the rows' segments."""
-        if not self.anchors.any():  # uncut: the anchors are the starts
-            alike = len(self.segment_of_row) == len(self.row_of_stamp)
-            return displacements if alike else displacements[:, :, self.row_of_stamp]
-        phase = matrices[:, 2] @ self.anchors.T
-        turn: Complex = (np.cos(phase) + 1j * np.sin(phase))[:, self.segment_of_row]
-        moved = (displacements[:, 0] + 1j * displacements[:, 1]) * turn
-        before = np.zeros((len(matrices), len(self.anchors) + 1), dtype=complex)
-        np.cumsum(moved[:, self.last_row], axis=1, out=before[:, 1:])
-        carried = before[:, :-1] - before[:, self.first_of_log]
-        at_rows = moved + carried[:, self.segment_of_row]
-        path = at_rows[:, self.row_of_stamp]
-        return np.stack([path.real, path.imag], axis=1)
-
-
-def join_segments(plan: ExpansionPlan) -> SegmentJoin:
-    """The indices of a plan's rows, segments and stamps."""
-    row_of_stamp, log_of_stamp, segment_of_row, last_row, first_of_log = (list[int]() for _ in range(5))
-    for index, path in enumerate(plan.paths):
-        first = len(last_row)
-        row_at: dict[int, int] = {}
-        for _, ends in plan.row_ends(index):
-            row_at |= {end: len(segment_of_row) + offset for offset, end in enumerate(ends)}
-            segment_of_row += [len(last_row)] * len(ends)
-            last_row.append(len(segment_of_row) - 1)
-            first_of_log.append(first)
-        row_of_stamp += [row_at[end] for end in path.ends.tolist()]
-        log_of_stamp += [index] * len(path.ends)
-    anchors = np.array([segment.anchor for segments in plan.segments for segment in segments])
-    of_stamps = np.array(row_of_stamp), np.array(log_of_stamp)
-    return SegmentJoin(*of_stamps, np.array(segment_of_row), anchors, np.array(last_row), np.array(first_of_log))
+    fewest = bisect_left(range(len(directions)), True, key=lambda count: neglected(count) <= plan.spare)
+    return directions[:fewest].T, neglected(fewest) * max(len(anchors) for _, anchors in plan.segments)
 
 
 class PoseEvaluator:
     """Poses at the stamps of some logs, for candidate matrices in a box. Made by :func:`make_evaluator`.
 
-    error_bound: largest difference of a position from direct integration, m.
+    error_bound: largest difference of a position from direct integration, m. size: memory that is kept, bytes.
+    combinations: number of those of polynomials that stand for the recordings. segments: that these are cut into.
     """
 
     def __init__(self, plan: ExpansionPlan) -> None:
-        box = plan.box
-        self._box = box
-        self._centre = box.centre[2]
-        self._scale = np.where(plan.free, box.reach[2], 1.0)
-        self._basis = plan.basis
-        moments = moments_of(plan)  # (R, n, 2N)
-        rows, terms, components = moments.shape
-        moments = np.ascontiguousarray(np.swapaxes(moments, 1, 2))
+        self._basis, self._centre = plan.basis, plan.box.centre[2]
+        self._scale = np.where(plan.free, plan.box.reach[2], 1.0)
+        # Indices that join rows, segments and stamps: the segment of each row, the first segment of each segment's log,
+        # the row and the log of each stamp.
+        row_ends, segment_of_row, first_of_log, row_of_stamp = [], list[int](), list[int](), list[int]()
+        for path, (edges, anchors) in zip(plan.paths, plan.segments, strict=True):
+            ends = np.union1d(path.ends, edges[1:-1])  # pieces up to each row
+            row_of_stamp += (len(segment_of_row) + np.searchsorted(ends, path.ends)).tolist()
+            row_ends.append(ends)
+            segment_of_row += (len(first_of_log) + np.searchsorted(edges, ends) - 1).tolist()
+            first_of_log += [len(first_of_log)] * len(anchors)
+        self._anchors = np.concatenate([anchors for _, anchors in plan.segments])  # (G, N), rad
+        self._segment_of_row, self._first_of_log = np.array(segment_of_row), np.array(first_of_log)
+        self._row_of_stamp = np.array(row_of_stamp)
+        self._last_row = np.searchsorted(self._segment_of_row, np.arange(len(self._anchors)), side="right") - 1
+        moments = moments_of(plan, row_ends)
         combinations, dropped = compress(moments, plan)
-        self.error_bound = plan.error + dropped
-        self._combinations = np.ascontiguousarray(combinations.T)  # (K, n)
+        rows, components, terms = moments.shape
         left = (moments.reshape(-1, terms) @ combinations).reshape(rows, components, -1)
         self._product = np.ascontiguousarray(np.transpose(left, (2, 1, 0)).reshape(-1, components * rows))  # (K, 2N R)
-        self._join = join_segments(plan)
-        starts = np.array([log.start for log in plan.logs])[self._join.log_of_stamp]
-        self._start = np.ascontiguousarray(starts.T)
+        self._combinations = np.ascontiguousarray(combinations.T)  # (K, n)
+        starts = np.array([log.start for log in plan.logs])
+        self._start = np.ascontiguousarray(np.repeat(starts, [len(path.ends) for path in plan.paths], axis=0).T)
         self._driven = np.concatenate([path.driven for path in plan.paths]).T
-
-    @property
-    def size(self) -> int:
-        """Memory that is kept, bytes."""
-        return int(self._product.nbytes + self._combinations.nbytes + self._driven.nbytes + self._start.nbytes)
-
-    @property
-    def combinations(self) -> int:
-        """Number of combinations of polynomials that stand for the recordings."""
-        return len(self._combinations)
-
-    @property
-    def segments(self) -> int:
-        """Number of segments that the recordings are cut into."""
-        return len(self._join.anchors)
-
-    def covers(self, matrices: Array) -> NDArray[np.bool_]:
-        """True (P,) for the matrices (P, 3, N) that lie in the box."""
-        inside = (matrices >= self._box.lower) & (matrices <= self._box.upper)
-        return np.asarray(inside.all(axis=(1, 2)))
+        self.error_bound = plan.error + dropped
+        self.size = sum(kept.nbytes for kept in (self._product, self._combinations, self._driven, self._start))
+        self.combinations, self.segments = len(self._combinations), len(self._anchors)
 
     def poses(self, matrices: Array) -> Array:
         """Poses (P, S, 3) in m, m, rad of matrices (P, 3, N) in the box. Headings are not wrapped."""
-        if len(matrices) == 1:
-            return self._poses(matrices)
-        with one_thread():
-            return self._poses(matrices)
-
-    def _poses(self, matrices: Array) -> Array:
         result = np.empty((len(matrices), *self._start.shape))
         block = max(1, _BLOCK // self._product.shape[1])
-        for first in range(0, len(matrices), block):
-            part = slice(first, first + block)
-            positions = self._join.positions(self._displacements(matrices[part]), matrices[part])
-            np.add(positions, self._start[:2], out=result[part, :2])
-        np.add(matrices[:, 2] @ self._driven, self._start[2], out=result[:, 2])
+        with nullcontext() if len(matrices) == 1 else one_thread():
+            for first in range(0, len(matrices), block):
+                part = matrices[first : first + block]
+                # x and y (P, 2, R) of every row relative to its segment's start, in the frame of its anchor, m.
+                features = self._combinations @ self._basis.values((part[:, 2] - self._centre) / self._scale)
+                weights = np.concatenate([part[:, 0], -part[:, 1], part[:, 1], part[:, 0]], axis=1)
+                regressors = (features.T @ self._product).reshape(len(part), weights.shape[1] // 2, -1)
+                displacements = weights.reshape(len(part), 2, -1) @ regressors
+                np.add(self._joined(displacements, part), self._start[:2], out=result[first : first + block, :2])
+            np.add(matrices[:, 2] @ self._driven, self._start[2], out=result[:, 2])
         return np.swapaxes(result, 1, 2)
 
-    def _displacements(self, matrices: Array) -> Array:
-        """x and y (P, 2, R) of every row relative to its segment's start, in the frame of its anchor, m."""
-        features = self._combinations @ self._basis.values((matrices[:, 2] - self._centre) / self._scale)
-        first, second = matrices[:, 0], matrices[:, 1]
-        weights = np.concatenate([first, -second, second, first], axis=1).reshape(len(matrices), 2, -1)
-        regressors = (features.T @ self._product).reshape(len(matrices), weights.shape[2], -1)
-        return np.asarray(weights @ regressors)
+    def _joined(self, displacements: Array, matrices: Array) -> Array:
+        """x and y (P, 2, S) relative to the start, m, from displacements (P, 2, R) within the rows' segments."""
+        if not self._anchors.any():  # uncut: the anchors are the starts
+            alike = len(self._segment_of_row) == len(self._row_of_stamp)
+            return displacements if alike else displacements[:, :, self._row_of_stamp]
+        phase = matrices[:, 2] @ self._anchors.T
+        turn: Complex = (np.cos(phase) + 1j * np.sin(phase))[:, self._segment_of_row]
+        moved = (displacements[:, 0] + 1j * displacements[:, 1]) * turn
+        before = np.zeros((len(matrices), self.segments + 1), dtype=complex)
+        np.cumsum(moved[:, self._last_row], axis=1, out=before[:, 1:])
+        carried = before[:, :-1] - before[:, self._first_of_log]
+        path = (moved + carried[:, self._segment_of_row])[:, self._row_of_stamp]
+        return np.stack([path.real, path.imag], axis=1)
+
+
+def moments_of(plan: ExpansionPlan, row_ends: Sequence[NDArray[np.intp]]) -> Array:
+    """Coefficients (R, 2N, n) of the regressors at the R rows of all logs: real parts of the N wheels, then imaginary.
+
+    row_ends: pieces up to each row of each log. n: terms of the plan's basis.
+    """
+    centre, reach = plan.box.centre[2], np.where(plan.free, plan.box.reach[2], 0.0)
+    quarter_turns = (plan.basis.orders.sum(axis=1) % 4)[:, None]
+    moments = []
+    for path, log, (edges, anchors), ends in zip(plan.paths, plan.logs, plan.segments, row_ends, strict=True):
+        rows = []  # sums (n, 2N) of cosines and sines up to each row
+        for first, last, anchor in zip(edges[:-1].tolist(), edges[1:].tolist(), anchors, strict=True):
+            angles, about = impulses(path, plan.integration, plan.nodes, slice(first, last), anchor)
+            heading = about @ centre + log.start[2]
+            sources = np.concatenate([angles * np.cos(heading)[..., None], angles * np.sin(heading)[..., None]], axis=2)
+            wheels = about.shape[2]
+            coefficients = plan.basis.coefficients(about.reshape(-1, wheels) * reach)
+            total, begin = 0.0, 0
+            for end in (ends[(ends > first) & (ends <= last)] - first).tolist():
+                summed = slice(begin * plan.nodes, end * plan.nodes)
+                total = total + coefficients[:, summed] @ sources[begin:end].reshape(-1, 2 * wheels)
+                begin = end
+                rows.append(total)
+        # Each term is to be times i^(total degree), Eq. (5).
+        cosine, sine = np.split(np.array(rows), 2, axis=2)
+        real = np.choose(quarter_turns, [cosine, -sine, -cosine, sine])
+        imaginary = np.choose(quarter_turns, [sine, cosine, -sine, -cosine])
+        moments.append(np.concatenate([real, imaginary], axis=2))
+    return np.ascontiguousarray(np.swapaxes(np.concatenate(moments), 1, 2))
 
 
 def make_evaluator(
@@ -655,9 +525,64 @@ def make_evaluator(
     # Both ways give the same poses, up to the bound and rounding, at the box's centre and some corners.
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(3, *box.centre.shape))
     matrices = np.concatenate([box.centre[None], box.centre + signs * box.reach])
-    direct = odometry.poses(matrices)
-    fast = evaluator.poses(matrices)
-    if fast.shape != direct.shape:
-        return None
-    length = max(1.0, float(np.abs(direct).max()))
-    return evaluator if np.abs(fast - direct).max() <= evaluator.error_bound + _ROUNDING * length else None
+    direct, fast = odometry.poses(matrices), evaluator.poses(matrices)
+    allowed = evaluator.error_bound + _ROUNDING * max(1.0, float(np.abs(direct).max()))
+    return evaluator if fast.shape == direct.shape and np.abs(fast - direct).max() <= allowed else None
+
+
+@dataclass(frozen=True, eq=False)
+class RunsEvaluator:
+    """Poses at the stamps of runs for matrices in a box, by the evaluators of parts of their logs.
+
+    frame: of the box and of the matrices that are evaluated, where the parameterisation keeps directions.
+    """
+
+    parts: Sequence[PoseEvaluator]
+    box: ElementBox
+    frame: DrivenFrame | None
+
+    @classmethod
+    def of(
+        cls,
+        logs: Sequence[WheelLog],
+        integration: Integration,
+        searched: Parameterisation,
+        lower: Array,
+        upper: Array,
+    ) -> RunsEvaluator | None:
+        """The evaluator for the matrices of vectors between ``lower`` and ``upper`` (n,).
+
+        None where direct integration is faster.
+        """
+        frame = None
+        if isinstance(searched, MatrixElements) and len(searched.null):
+            signals = searched.null.shape[1]
+            _, _, directions = np.linalg.svd(np.vstack([searched.null, np.zeros((signals, signals))]))
+            frame = DrivenFrame(directions[len(searched.null) :], searched.robot.inverse_kinematic_matrix)
+        box, parts = ElementBox.of(searched, lower, upper, frame), []
+        for part in parts_of(logs):
+            seen = part if frame is None else frame.logs(part)
+            evaluator = make_evaluator(OdometryBatch(seen, integration), seen, integration, box)
+            if evaluator is None:
+                return None
+            parts.append(evaluator)
+        return cls(parts, box, frame)
+
+    @property
+    def size(self) -> int:
+        """Memory that is kept, bytes."""
+        return sum(part.size for part in self.parts)
+
+    def seen(self, matrices: Array) -> Array:
+        """Matrices (P, 3, M) as they are evaluated: in the frame, (P, 3, r + 3), if there is one."""
+        return matrices if self.frame is None else self.frame.seen(matrices)
+
+    def covers(self, seen: Array) -> NDArray[np.bool_]:
+        """True (P,) for the matrices that lie in the box."""
+        return np.asarray(((seen >= self.box.lower) & (seen <= self.box.upper)).all(axis=(1, 2)))
+
+    def poses(self, seen: Array) -> Array:
+        """Poses (P, S, 3) of matrices in the box, see PoseEvaluator."""
+        if len(self.parts) == 1:
+            return self.parts[0].poses(seen)
+        return np.concatenate([part.poses(seen) for part in self.parts], axis=1)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
 from omnibench.config import Model
-from omnibench.fit.parameterisation import Bounds, ParameterisationName, checked
+from omnibench.fit.parameterisation import Bounds, MatrixElements, ParameterisationName, checked
 from omnibench.robot import kinematics
 from omnibench.robot.physical import Geometry, Number, PhysicalParameter, unit_of
 
@@ -107,7 +107,8 @@ class WheelGeometry:
             "mount_yaw": np.radians(deviation_range(limits.yaw_deg)),
         }
         low, high = np.array([ranges[number.kind] for number in self._numbers]).T
-        return checked(Bounds("limits", self.start + low * self.scale, self.start + high * self.scale), self)
+        box = Bounds("limits", self.start + low * self.scale, self.start + high * self.scale)
+        return checked(box, self.names, self.start)
 
     @property
     def projection(self) -> kinematics.Array:
@@ -126,6 +127,9 @@ class WheelGeometry:
         completed: kinematics.Array = np.tile(self._every.design, (len(vectors), 1))
         completed[:, self._searched] = vectors
         return completed
+
+
+Parameterisation = MatrixElements | WheelGeometry  # what is searched
 
 
 def searched_parameters(geometry: WheelGeometry, vector: kinematics.Array) -> tuple[PhysicalParameter, ...]:

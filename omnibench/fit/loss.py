@@ -49,7 +49,6 @@ from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.robot.kinematics import Array, Robot, compose, relative
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
-from omnibench.words import plural
 
 LossName = Literal["squares", "huber", "student_t"]
 
@@ -68,41 +67,40 @@ _MOST_STEPS = 100
 _SAMPLE = 2000  # norms of which more are not needed to find where Newton's steps begin: they then take two or three
 _SETTLED = 1e-13  # relative change of 1/s^2 that ends them
 _BESIDE = 3  # poses beside an end that tell where it was: the fewest of which one may be off, too
-_NAMED = 5  # runs that a sentence names
 _FEWEST_RUNS = 5  # fewer ends do not tell how far an end usually is from what the poses beside it say
 
 
-class Loss(ABC):
-    """A loss of the norms of errors of ``coordinates`` d coordinates."""
+class Loss:
+    """A loss of the norms of errors of ``coordinates`` d coordinates: squares, whose cost is their root mean square."""
 
-    name: LossName
+    name: LossName = "squares"
 
     def __init__(self, coordinates: int) -> None:
         self.coordinates = coordinates
 
-    @abstractmethod
-    def scales(self, norms: Array, shares: Array) -> Array:
+    def scales(self, norms: Array, shares: Array) -> Array:  # noqa: ARG002 (squares need none)
         """Scales (P,) of P sets of norms (P, S) with shares (S,)."""
+        return np.ones(len(norms))
 
-    @abstractmethod
     def costs(self, norms: Array, shares: Array) -> Array:
         """Costs (P,), in the unit of the norms (P, S), at the scales that minimise them; NaN of norms that are NaN."""
+        return np.asarray(np.sqrt(np.square(norms) @ shares))
 
-    @abstractmethod
     def weights(self, ratios: Array) -> Array:
         """Weights w (...), Eq. (5), of ratios x (...) of norms to their scale."""
+        return np.ones(ratios.shape)
+
+    def slopes(self, ratios: Array) -> Array:
+        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
+        return np.zeros(ratios.shape)
 
     def is_near(self, norms: Array, shares: Array) -> NDArray[np.bool_]:
         """True (S,) for the norms (S,) that are not far off the others, by their weights."""
         ratios = norms / self.scales(norms[None], shares)[0]
         return np.asarray(self.weights(ratios) >= OFF * self.weights(np.zeros(1)))
 
-    @abstractmethod
-    def slopes(self, ratios: Array) -> Array:
-        """Derivatives x w'(x) (...) of the weights by the logarithm of the ratios x (...)."""
 
-
-class ScaledLoss(Loss):
+class ScaledLoss(Loss, ABC):
     """A loss whose scale is estimated with the norms."""
 
     _target: float  # the right side of Eq. (2) or (4)
@@ -141,7 +139,7 @@ class ScaledLoss(Loss):
 class Huber(ScaledLoss):
     """Squares of small errors and magnitudes of large ones, Eq. (1)."""
 
-    name: LossName = "huber"
+    name = "huber"
 
     def __init__(self, coordinates: int) -> None:
         super().__init__(coordinates)
@@ -162,7 +160,7 @@ class Huber(ScaledLoss):
         return np.minimum(squares, self.corner**2), np.where(squares < self.corner**2, 1.0, 0.0)
 
     def costs(self, norms: Array, shares: Array) -> Array:
-        """Costs (P,), the minima of Eq. (1), in the unit of the norms (P, S); NaN of norms that are NaN."""
+        """Costs (P,), the minima of Eq. (1)."""
         scales = self.scales(norms, shares)
         ratios = norms / scales[:, None]
         small = np.minimum(ratios, self.corner)
@@ -172,7 +170,7 @@ class Huber(ScaledLoss):
 class StudentT(ScaledLoss):
     """Minus the log-likelihood of Student's t with four degrees of freedom, Eq. (3)."""
 
-    name: LossName = "student_t"
+    name = "student_t"
 
     def __init__(self, coordinates: int) -> None:
         super().__init__(coordinates)
@@ -193,39 +191,17 @@ class StudentT(ScaledLoss):
         return total * squares / left, total * DEGREES_OF_FREEDOM / np.square(left)
 
     def costs(self, norms: Array, shares: Array) -> Array:
-        """Costs (P,), exp of the minima of Eq. (3), in the unit of the norms (P, S); NaN of norms that are NaN."""
+        """Costs (P,), exp of the minima of Eq. (3)."""
         scales = self.scales(norms, shares)
         logarithms = np.log1p(np.square(norms / scales[:, None]) / DEGREES_OF_FREEDOM) @ shares
         power = (DEGREES_OF_FREEDOM + self.coordinates) / (2 * self.coordinates)
         return np.asarray(scales * np.exp(power * logarithms))
 
 
-class Squares(Loss):
-    """Squares, whatever their size: the cost is their root mean square, which has no scale."""
-
-    name: LossName = "squares"
-
-    def costs(self, norms: Array, shares: Array) -> Array:
-        """Root mean squares (P,) of norms (P, S)."""
-        return np.asarray(np.sqrt(np.square(norms) @ shares))
-
-    def scales(self, norms: Array, shares: Array) -> Array:  # noqa: ARG002 (none is needed)
-        """1 for every set of norms (P, S)."""
-        return np.ones(len(norms))
-
-    def weights(self, ratios: Array) -> Array:
-        """1 for every ratio."""
-        return np.ones(ratios.shape)
-
-    def slopes(self, ratios: Array) -> Array:
-        """0 for every ratio."""
-        return np.zeros(ratios.shape)
-
-
-def make_loss(name: LossName, coordinates: int) -> Loss | None:
-    """The loss of that name for errors of some coordinates; None for squares, which bound nothing."""
-    kinds: dict[str, type[Loss]] = {"huber": Huber, "student_t": StudentT}
-    return kinds[name](coordinates) if name in kinds else None
+def make_loss(name: LossName, coordinates: int) -> Loss:
+    """The loss of that name for errors of some coordinates."""
+    kinds: dict[LossName, type[Loss]] = {"squares": Loss, "huber": Huber, "student_t": StudentT}
+    return kinds[name](coordinates)
 
 
 def with_ends_from_others(
@@ -240,14 +216,12 @@ def with_ends_from_others(
 
     loss: of three coordinates, m and rad alike. last: the last poses are treated alike, for a cost that uses no others.
     """
-    if len(runs) < _FEWEST_RUNS:
-        return tuple(runs), ()
     design = OdometryModel.of_design(robot, integration)
     moved, names = list(runs), set()
+    long_enough = [index for index, run in enumerate(runs) if len(run.poses) > _BESIDE]
     for end in (0, -1) if last else (0,):
-        long_enough = [index for index, run in enumerate(runs) if len(run.poses) > _BESIDE]
         if len(long_enough) < _FEWEST_RUNS:
-            continue
+            break
         beside = np.arange(1, 1 + _BESIDE) if end == 0 else np.arange(-1 - _BESIDE, -1)
         medians = []
         for run in (runs[index] for index in long_enough):
@@ -266,18 +240,6 @@ def with_ends_from_others(
     return tuple(moved), tuple(run.id for run in runs if run.id in names)
 
 
-def moved_ends_in_words(names: Sequence[str], runs: int, *, last: bool) -> tuple[str, ...]:
-    """A sentence on the runs (``names``) of all (their number) whose start or end has jumped; none where none has."""
-    if not names:
-        return ()
-    which = "start or end" if last else "start"
-    named = f"{', '.join(names[:_NAMED])}{' ...' if len(names) > _NAMED else ''}"
-    return (
-        f"{plural(len(names), 'run')} of {runs} ({named}): the reference pose at the {which} is far from what the "
-        "poses beside it say, which are used in its place",
-    )
-
-
 class RobustCost(Cost):
     """The norms of a cost's pose errors under a loss with an estimated scale, Eq. (1) to (4).
 
@@ -288,25 +250,16 @@ class RobustCost(Cost):
     def __init__(self, base: SumOfNorms, loss: Loss) -> None:
         super().__init__(base.options)
         self.base, self.loss = base, loss
-        self.name, self.stamps, self.rounding = base.name, base.stamps, base.rounding
-
-    @property
-    def coordinates(self) -> tuple[float, float, float]:
-        """The weights of the cost."""
-        return self.base.weights
-
-    @property
-    def of_poses(self) -> Loss:
-        """This kind of loss for whole poses, m, m, rad."""
-        return type(self.loss)(3)
+        self.name, self.stamps, self.rounding, self.coordinates = (
+            base.name,
+            base.stamps,
+            base.rounding,
+            base.coordinates,
+        )
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,), m: at the scale of each candidate's own errors."""
         return self.loss.costs(self.base.norms(errors), self.base.shares(trajectory))
-
-    def weights(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
-        """Weights (S,), Eq. (5), of errors (S, 3) of one candidate; 1 or less for Huber's, for t up to (n + d) / n."""
-        return self.loss.weights(self.ratios(errors, trajectory))
 
     def ratios(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Norms (S,) of errors (S, 3) of one candidate over their scale."""
@@ -326,9 +279,7 @@ def with_loss(cost: Cost, loss: LossName) -> Cost:
         return cost
     if not isinstance(cost, SumOfNorms):
         raise ConfigError(f"loss: {loss} weighs norms of pose errors, and the cost {cost.name} is no sum of norms")
-    chosen = make_loss(loss, sum(map(bool, cost.weights)))
-    assert chosen is not None  # only squares have none
-    return RobustCost(cost, chosen)
+    return RobustCost(cost, make_loss(loss, sum(map(bool, cost.weights))))
 
 
 def loss_of(cost: Cost) -> LossName:

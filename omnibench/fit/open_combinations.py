@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.data.references import UNITS
-from omnibench.fit.parameterisation import MatrixElements, Parameterisation
+from omnibench.fit.geometry import Parameterisation
+from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
 from omnibench.fit.span import DrivenSpan, Treatment, directions_kept, driven_span

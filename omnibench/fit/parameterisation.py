@@ -1,10 +1,10 @@
-"""Parameterisations: the vector that a calibrator searches, its box, and the matrix that it stands for."""
+"""The vector that a calibrator searches, its box, and the matrix that it stands for; a geometry is in geometry.py."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from pydantic import FiniteFloat
@@ -42,32 +42,6 @@ class Bounds:
     upper: Array
 
 
-class Parameterisation(Protocol):
-    """A mapping from vectors of n numbers to inverse kinematic matrices."""
-
-    @property
-    def name(self) -> ParameterisationName: ...
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the n numbers."""
-
-    @property
-    def start(self) -> Array:
-        """The vector (n,) of the design values."""
-
-    @property
-    def bounds(self) -> Bounds: ...
-    @property
-    def projection(self) -> Array:
-        """The matrix (n, n) that takes from a deviation of the vector what leaves the matrix as it is."""
-
-    def matrices(self, vectors: Array) -> Array:
-        """Inverse kinematic matrices (P, 3, N) of vectors (P, n)."""
-
-    def slopes(self, vector: Array) -> Array:
-        """Derivatives (3N, n) of the matrix elements, row by row, by the vector (n,)."""
-
-
 @dataclass(frozen=True, eq=False)
 class MatrixElements:
     """Elements of the matrix row by row, Eq. (4) and (5): the paper's non-parametric calibration.
@@ -88,15 +62,18 @@ class MatrixElements:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the n numbers that are searched."""
         return tuple(f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(self.robot.drive.names) + 1))
 
     @property
     def start(self) -> Array:
+        """The vector (n,) of the design values."""
         return self.robot.inverse_kinematic_matrix.ravel()
 
     @property
     def bounds(self) -> Bounds:
-        return checked(make_bounds(self.robot, self.box), self)
+        """The box of the vector. ConfigError: it excludes the start."""
+        return checked(make_bounds(self.robot, self.box), self.names, self.start)
 
     def matrices(self, vectors: Array) -> Array:
         """Matrices (P, 3, M): the elements, without deviations along ``null`` and those that make wheels slide."""
@@ -118,6 +95,7 @@ class MatrixElements:
 
     @property
     def projection(self) -> Array:
+        """The matrix (n, n) that takes from a deviation of the vector what leaves the matrix as it is."""
         projection: Array = np.kron(self.rows, np.eye(len(self.robot.drive.names)) - self.null.T @ self.null)
         if self.open is not None and len(self.open):
             kept = self.units[:, None] * self.open.T @ self.open / self.units
@@ -153,9 +131,9 @@ def make_bounds(robot: Robot, box: Box) -> Bounds:
     return Bounds(box, (start - width).ravel(), (start + width).ravel())
 
 
-def checked(bounds: Bounds, searched: Parameterisation) -> Bounds:
-    """The bounds; ConfigError if they are reversed or exclude the start."""
-    for name, low, high, value in zip(searched.names, bounds.lower, bounds.upper, searched.start, strict=True):
+def checked(bounds: Bounds, names: tuple[str, ...], start: Array) -> Bounds:
+    """The bounds of a vector (n,); ConfigError if they are reversed or exclude the start."""
+    for name, low, high, value in zip(names, bounds.lower, bounds.upper, start, strict=True):
         if low > high:
             raise ConfigError(f"box: lower bound {low:g} of {name} is above its upper bound {high:g}")
         if not low <= value <= high:

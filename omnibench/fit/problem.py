@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import median_period
 from omnibench.errors import DataError
-from omnibench.fit import evaluator as fast
 from omnibench.fit.cost import Cost
-from omnibench.fit.geometry import GeometryLimits, WheelGeometry
-from omnibench.fit.loss import RobustCost, moved_ends_in_words, norms_of, with_ends_from_others, with_loss
+from omnibench.fit.evaluator import RunsEvaluator
+from omnibench.fit.geometry import GeometryLimits, Parameterisation, WheelGeometry
+from omnibench.fit.loss import RobustCost, make_loss, with_ends_from_others, with_loss
 from omnibench.fit.open_combinations import with_open_combinations
-from omnibench.fit.parameterisation import Box, MatrixElements, Parameterisation, ParameterisationName
+from omnibench.fit.parameterisation import Box, MatrixElements, ParameterisationName
 from omnibench.fit.prior import MountChoice, default_mount
 from omnibench.fit.reference_rows import ReferenceBatch
 from omnibench.fit.settings import Budget as Budget
@@ -30,6 +30,7 @@ from omnibench.registry import costs
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration, OdometryBatch
 from omnibench.robot.stored_odometry import StoredOdometry
+from omnibench.words import plural
 
 _PROGRESS_PERIOD = 0.1  # s, least time between two reports of progress: ten a second are all that a reader sees
 _MOST_POSES = 4_000_000  # poses of candidates that are held together, 0.1 GB (chosen)
@@ -39,6 +40,7 @@ _WORTH_BUILDING = 50
 # The same for stored runs, which every direct integration reads from their files: building takes 19 us a sample, one
 # evaluation 0.05 us (chosen).
 _WORTH_BUILDING_OF_STORED = 400
+_NAMED = 5  # runs that a sentence names
 _ON_BOUND = 1e-6  # share of the box's width: an element closer than that to a bound lies on it
 _ROUNDING = 1e-12  # share of a bound: an element beyond it by less lies in the box
 
@@ -63,18 +65,78 @@ class Improvement:
     cost: float
 
 
-class SearchBox:
-    """The box of a searched vector (n,): its names, its start, its bounds, and its part that is free.
+class CalibrationProblem:
+    """Training trajectories, a start, a box, a budget and a cost to be minimised.
 
-    free (n,): True for elements that may be searched; the others keep their start values.
+    trajectories: the training runs; a calibrator cannot reach the validation runs. moved_ends: a sentence on those of
+    which the start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
+    start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements. free (n,): True
+    for elements that may be searched; the others keep their start values.
+    objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
+    values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
+    rng: the only source of randomness that a calibrator may use.
+    budget: the limits of the run. evaluations: candidates that were evaluated. best_vector (n,), best_cost: the best
+    candidate in the box so far; the start, and infinity, before the first. history: every improvement of the best cost.
+    span: what the runs drive; default: computed when it is first asked for.
+    watch: told the evaluations and the best cost so far, at most every 0.1 s.
+    tolerance, mount: standard deviation of the design's elements, and whether the tracked point may stand elsewhere,
+    for calibrators that weigh the design; None: as is usual for the robot's class.
     """
 
-    def __init__(self, names: tuple[str, ...], start: Array, lower: Array, upper: Array) -> None:
-        self.names = names
-        self.start = _read_only(start)
-        self.lower = _read_only(lower)
-        self.upper = _read_only(upper)
+    def __init__(
+        self,
+        robot: Robot,
+        trajectories: Sequence[Trajectory],
+        cost: Cost,
+        parameterisation: Parameterisation,
+        *,
+        integration: Integration,
+        budget: Budget,
+        seed: int,
+        tolerance: float | None = None,
+        mount: MountChoice | None = None,
+        span: DrivenSpan | None = None,
+        watch: Reporter = no_progress,
+    ) -> None:
+        if not trajectories:
+            raise DataError("no trajectories; nothing can be calibrated")
+        self.robot = robot
+        self.trajectories = tuple(trajectories)
+        self.moved_ends: tuple[str, ...] = ()
+        if isinstance(cost, RobustCost):
+            last, loss = cost.stamps == "final", make_loss(cost.loss.name, 3)
+            self.trajectories, moved = with_ends_from_others(self.trajectories, robot, integration, loss, last=last)
+            if moved:
+                which = "start or end" if last else "start"
+                named = f"{', '.join(moved[:_NAMED])}{' ...' if len(moved) > _NAMED else ''}"
+                self.moved_ends = (
+                    f"{plural(len(moved), 'run')} of {len(self.trajectories)} ({named}): the reference pose at the "
+                    f"{which} is far from what the poses beside it say, which are used in its place",
+                )
+        self.objective = cost
+        self.parameterisation = parameterisation
+        self.tolerance, self.mount = tolerance, mount
+        self.integration: Integration = integration
+        self.seed = seed
+        self.rng = np.random.default_rng(seed)
+        self.odometry = cost.batch(self.trajectories, integration)
+        # x, y and heading contiguous, the memory order in which the odometry returns poses.
+        self.reference = _read_only(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
+        bounds, start, relevant = parameterisation.bounds, parameterisation.start, self._relevant()
+        self.box = bounds.name
+        self.names, self.start = parameterisation.names, _read_only(start)
+        self.lower = _read_only(np.where(relevant, bounds.lower, start))
+        self.upper = _read_only(np.where(relevant, bounds.upper, start))
         self.free: NDArray[np.bool_] = _read_only(self.upper > self.lower)
+        self.budget, self.evaluations, self.best_vector, self.best_cost = budget, 0, self.start, np.inf
+        self.history: list[Improvement] = []
+        self._watch, self._shown = watch, 0.0  # s after the begin when ``watch`` was last called
+        self._began = time.perf_counter()  # s, of that clock
+        self._span = span
+        self._evaluator: RunsEvaluator | None = None
+        self._evaluator_tried = False
+
+    # The box.
 
     @property
     def size(self) -> int:
@@ -107,122 +169,11 @@ class SearchBox:
         within = (vectors >= self.lower - slack) & (vectors <= self.upper + slack)
         return np.asarray(within.all(axis=-1))
 
-    def on_bounds(self, vectors: Array) -> NDArray[np.bool_]:
-        """True (..., n) for the free elements of vectors (..., n) that lie on a bound of the box."""
-        margin = _ON_BOUND * (self.upper - self.lower)
-        return np.asarray(self.free & ((vectors <= self.lower + margin) | (vectors >= self.upper - margin)))
-
     def at_bounds(self, vector: Array) -> tuple[str, ...]:
         """Names of the free elements that lie on a bound of the box."""
-        return tuple(name for name, touching in zip(self.names, self.on_bounds(vector), strict=True) if touching)
-
-
-class Record:
-    """Evaluations, seconds and best candidates of one run of a calibrator, within its budget."""
-
-    def __init__(self, budget: Budget, start: Array, watch: Reporter) -> None:
-        self.budget = budget
-        self.evaluations = 0
-        self.best_vector = start
-        self.best_cost = np.inf
-        self.history: list[Improvement] = []
-        self._watch = watch
-        self._began = time.perf_counter()  # s, of that clock
-        self._shown = 0.0  # s after that when ``watch`` was last called
-
-    @property
-    def remaining(self) -> int:
-        """Evaluations that the budget still allows."""
-        return self.budget.evaluations - self.evaluations
-
-    @property
-    def seconds(self) -> float:
-        """Wall time since the record began."""
-        return time.perf_counter() - self._began
-
-    def check_budget(self) -> None:
-        """Raise BudgetSpent if no evaluations or no seconds are left."""
-        if self.remaining <= 0:
-            raise BudgetSpent("budget", f"budget of {self.budget.evaluations} evaluations spent")
-        if self.seconds > self.budget.seconds:
-            raise BudgetSpent("time", f"time budget of {self.budget.seconds:g} s spent")
-
-    def add(self, candidates: Array, values: Array, box: SearchBox) -> None:
-        """Count candidates (P, n) with their costs (P,), keep each in the box that is better than all before it."""
-        if (values < self.best_cost).any():
-            eligible = np.where(np.isfinite(values) & box.inside(candidates), values, np.inf)
-            running = np.minimum.accumulate(np.concatenate([[self.best_cost], eligible]))
-            for index in np.flatnonzero(running[1:] < running[:-1]):
-                self.best_cost = float(eligible[index])
-                self.best_vector = _read_only(candidates[index])
-                self.history.append(Improvement(self.evaluations + int(index) + 1, self.seconds, self.best_cost))
-        self.evaluations += len(candidates)
-        self.report(self.evaluations, self.budget.evaluations, "evaluation", self.best_cost)
-
-    def report(self, done: int, total: int, unit: str, best: float | None = None) -> None:
-        """Report progress, at most every 0.1 s."""
-        if self.seconds - self._shown > _PROGRESS_PERIOD:
-            self._shown = self.seconds
-            self._watch(Progress("search", done, total, unit, best))
-
-
-class CalibrationProblem(SearchBox):
-    """Training trajectories, a start, a box, a budget and a cost to be minimised.
-
-    trajectories: the training runs; a calibrator cannot reach the validation runs. ends_moved: names of those whose
-    start (or end) has jumped, and is taken from the poses beside it, as a robust loss does.
-    start (n,): the vector of the design values; lower, upper (n,): its box; names: of its n elements.
-    objective: the Cost. cost(candidates): its values, counted against the budget and recorded; a search calls this.
-    values(candidates): the same values, neither counted nor recorded; for judging an answer, not for searching.
-    rng: the only source of randomness that a calibrator may use.
-    span: what the runs drive; default: computed when it is first asked for.
-    watch: told the evaluations and the best cost so far, at most every 0.1 s.
-    tolerance, mount: standard deviation of the design's elements, and whether the tracked point may stand elsewhere,
-    for calibrators that weigh the design; None: as is usual for the robot's class.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        trajectories: Sequence[Trajectory],
-        cost: Cost,
-        parameterisation: Parameterisation,
-        *,
-        integration: Integration,
-        budget: Budget,
-        seed: int,
-        tolerance: float | None = None,
-        mount: MountChoice | None = None,
-        span: DrivenSpan | None = None,
-        watch: Reporter = no_progress,
-    ) -> None:
-        if not trajectories:
-            raise DataError("no trajectories; nothing can be calibrated")
-        self.robot = robot
-        self.trajectories = tuple(trajectories)
-        self.ends_moved: tuple[str, ...] = ()
-        if isinstance(cost, RobustCost):
-            self.trajectories, self.ends_moved = with_ends_from_others(
-                self.trajectories, robot, integration, cost.of_poses, last=cost.stamps == "final"
-            )
-        self.objective = cost
-        self.parameterisation = parameterisation
-        self.tolerance, self.mount = tolerance, mount
-        self.integration: Integration = integration
-        self.seed = seed
-        self.rng = np.random.default_rng(seed)
-        self.odometry = cost.batch(self.trajectories, integration)
-        # x, y and heading contiguous, the memory order in which the odometry returns poses.
-        self.reference = _read_only(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
-        bounds, start, relevant = parameterisation.bounds, parameterisation.start, self._relevant()
-        self.box = bounds.name
-        lower, upper = np.where(relevant, bounds.lower, start), np.where(relevant, bounds.upper, start)
-        super().__init__(parameterisation.names, start, lower, upper)
-        self.record = Record(budget, self.start, watch)
-        self._span = span
-        self._evaluator: fast.PoseEvaluator | fast.PartedEvaluator | None = None
-        self._frame: fast.DrivenFrame | None = None  # of the evaluator's matrices, where directions are kept
-        self._evaluator_tried = False
+        margin = _ON_BOUND * (self.upper - self.lower)
+        touching = self.free & ((vector <= self.lower + margin) | (vector >= self.upper - margin))
+        return tuple(name for name, touches in zip(self.names, touching, strict=True) if touches)
 
     # What the runs identify.
 
@@ -247,57 +198,35 @@ class CalibrationProblem(SearchBox):
         """The median time between wheel samples, s."""
         return median_period(self.trajectories)
 
-    @property
-    def moved_ends(self) -> tuple[str, ...]:
-        """A sentence on the runs whose start or end has jumped; none where none has."""
-        last = self.objective.stamps == "final"
-        return moved_ends_in_words(self.ends_moved, len(self.trajectories), last=last)
-
     # What the run has spent and found.
-
-    @property
-    def budget(self) -> Budget:
-        """The limits of the run."""
-        return self.record.budget
-
-    @property
-    def evaluations(self) -> int:
-        """Candidates that were evaluated."""
-        return self.record.evaluations
 
     @property
     def remaining(self) -> int:
         """Evaluations that the budget still allows."""
-        return self.record.remaining
+        return self.budget.evaluations - self.evaluations
 
     @property
     def seconds(self) -> float:
         """Wall time since the problem was made."""
-        return self.record.seconds
+        return time.perf_counter() - self._began
 
     @property
     def seconds_left(self) -> float:
         """Wall time that the budget still allows, s; for methods that ask for no costs."""
         return self.budget.seconds - self.seconds
 
-    @property
-    def best_vector(self) -> Array:
-        """The best candidate (n,) in the box so far; the start before the first."""
-        return self.record.best_vector
-
-    @property
-    def best_cost(self) -> float:
-        """The cost of the best candidate so far; infinity before the first."""
-        return self.record.best_cost
-
-    @property
-    def history(self) -> list[Improvement]:
-        """Every improvement of the best cost."""
-        return self.record.history
-
     def report(self, done: int, total: int, unit: str, best: float | None = None) -> None:
         """Report the progress of a method that does not call ``cost``, which reports by itself."""
-        self.record.report(done, total, unit, best)
+        if self.seconds - self._shown > _PROGRESS_PERIOD:
+            self._shown = self.seconds
+            self._watch(Progress("search", done, total, unit, best))
+
+    def _check_budget(self) -> None:
+        """Raise BudgetSpent if no evaluations or no seconds are left."""
+        if self.remaining <= 0:
+            raise BudgetSpent("budget", f"budget of {self.budget.evaluations} evaluations spent")
+        if self.seconds_left < 0:
+            raise BudgetSpent("time", f"time budget of {self.budget.seconds:g} s spent")
 
     # Costs of candidates.
 
@@ -311,7 +240,7 @@ class CalibrationProblem(SearchBox):
         candidates = np.array(candidates, dtype=float, ndmin=2)
         if candidates.shape[1:] != self.start.shape:
             raise ValueError(f"candidates have shape {candidates.shape}, expected (P, {self.size})")
-        self.record.check_budget()
+        self._check_budget()
         asked = len(candidates)
         candidates = candidates[: self.remaining]
         values, count = np.empty(len(candidates)), 0
@@ -321,28 +250,33 @@ class CalibrationProblem(SearchBox):
             part = candidates[count : count + self._part_size]
             of_part = self._costs(part, self._evaluator) if self._evaluator else self.values(part)
             values[count : count + len(part)] = of_part
-            self.record.add(part, of_part, self)
+            if (of_part < self.best_cost).any():
+                eligible = np.where(np.isfinite(of_part) & self.inside(part), of_part, np.inf)
+                running = np.minimum.accumulate(np.concatenate([[self.best_cost], eligible]))
+                for index in np.flatnonzero(running[1:] < running[:-1]).tolist():
+                    self.best_cost, self.best_vector = float(eligible[index]), _read_only(part[index])
+                    self.history.append(Improvement(self.evaluations + index + 1, self.seconds, self.best_cost))
             count += len(part)
+            self.evaluations += len(part)
+            self.report(self.evaluations, self.budget.evaluations, "evaluation", self.best_cost)
             if count < asked:
-                self.record.check_budget()
+                self._check_budget()
         return values
 
     def values(self, candidates: Array) -> Array:
         """Costs (P,) of candidates (P, n) by direct integration, not counted: for scoring an answer."""
         return self._costs(candidates, None)
 
-    def build_evaluator(self) -> fast.PoseEvaluator | fast.PartedEvaluator | None:
+    def build_evaluator(self) -> RunsEvaluator | None:
         """Build the fast evaluator, which ``cost`` then uses in the place of direct integration, and return it.
 
         None where direct integration is faster, or the runs have references other than poses. ``cost`` calls this when
         a search asks for many candidates. The costs of both ways are equal to 1e-11.
         """
         if not self._evaluator_tried and isinstance(self.odometry, OdometryBatch):
-            logs, searched = self.objective.logs(self.trajectories), self.parameterisation
-            if isinstance(searched, MatrixElements) and len(searched.null):
-                self._frame = fast.DrivenFrame.of(searched)
-            box = fast.ElementBox.of(self._frame or searched, self.lower, self.upper)
-            self._evaluator = fast.evaluator_of_runs(logs, self.integration, box, self._frame)
+            logs = self.objective.logs(self.trajectories)
+            box = self.parameterisation, self.lower, self.upper
+            self._evaluator = RunsEvaluator.of(logs, self.integration, *box)
         self._evaluator_tried = True
         return self._evaluator
 
@@ -378,7 +312,7 @@ class CalibrationProblem(SearchBox):
             return 1  # the first candidate tells the time that one takes
         return max(int(min(self.seconds_left / self.seconds * self.evaluations, self.budget.evaluations)), 1)
 
-    def _costs(self, candidates: Array, evaluator: fast.PoseEvaluator | fast.PartedEvaluator | None) -> Array:
+    def _costs(self, candidates: Array, evaluator: RunsEvaluator | None) -> Array:
         """Costs (P,) by the fast evaluator for candidates in its box, by direct integration for the others."""
         together = max(_MOST_POSES // max(len(self.odometry.trajectory), 1), 1)  # matrices whose poses are held at once
         values = []
@@ -389,7 +323,7 @@ class CalibrationProblem(SearchBox):
                 if evaluator is None:
                     values.append(self._costs_of_poses(self.odometry.poses(part)))
                     continue
-                seen = part if self._frame is None else self._frame.seen(part)
+                seen = evaluator.seen(part)
                 covered = evaluator.covers(seen)
                 if covered.all():
                     values.append(self._costs_of_poses(evaluator.poses(seen)))
@@ -406,16 +340,13 @@ class CalibrationProblem(SearchBox):
 
     def _relevant(self) -> NDArray[np.bool_]:
         """True (n,) for elements that the cost depends on: for headings alone those of row 3."""
-        cost = norms_of(self.objective)
-        start = self.parameterisation.start
         if not isinstance(self.parameterisation, MatrixElements):
-            return np.ones(len(start), dtype=bool)
+            return np.ones(len(self.parameterisation.start), dtype=bool)
         used = np.repeat(self.parameterisation.rows.any(axis=0), len(self.robot.drive.names))
-        if (cost is None or 0.0 not in cost.weights) and not isinstance(self.odometry, ReferenceBatch):
+        if 0.0 not in self.objective.coordinates and not isinstance(self.odometry, ReferenceBatch):
             return used
-        slopes: Array = np.abs(self.odometry.jacobian(self.matrix(start))).max(axis=0)  # (3, 3, N)
-        weights = (1.0, 1.0, 1.0) if cost is None else cost.weights
-        return np.asarray(used & ((np.abs(weights) @ slopes.reshape(3, -1)) > 0))
+        slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.parameterisation.start))).max(axis=0)
+        return np.asarray(used & ((np.abs(self.objective.coordinates) @ slopes.reshape(3, -1)) > 0))
 
 
 def make_problem(

@@ -115,12 +115,11 @@ def without_jumps(
 
     Where most of a run's poses are off, its start is, which shifts or turns them all: the run is left out.
     """
-    chosen = make_loss(loss, 3)
-    if chosen is None:
+    if loss == "squares":
         return list(runs), list(residuals)
     counts = np.array([len(of_run) for of_run in residuals])
     shares = np.repeat(1 / (np.maximum(counts, 1) * max(np.count_nonzero(counts), 1)), counts)
-    all_near = chosen.is_near(np.linalg.norm(np.concatenate(residuals), axis=1), shares)
+    all_near = make_loss(loss, 3).is_near(np.linalg.norm(np.concatenate(residuals), axis=1), shares)
     near = [of_run & (of_run.mean() > 1 / 2) for of_run in np.split(all_near, np.cumsum(counts)[:-1])]
     shortened = [
         (with_poses(run, np.append(0, 1 + np.flatnonzero(used))), of_run[used])

@@ -24,8 +24,8 @@ from wheeled_samples import driven
 
 from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.cli.terminal.comparison_tables import print_result
-from omnibench.cli.terminal.inspection_summary import print_inspection
 from omnibench.cli.terminal.progress_display import ProgressDisplay
+from omnibench.cli.terminal.recording_tables import print_inspection
 from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset

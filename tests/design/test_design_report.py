@@ -12,7 +12,7 @@ from report_samples import flower
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
-from omnibench.cli.terminal.design_summary import print_design
+from omnibench.cli.terminal.recording_tables import print_design
 from omnibench.design.candidates import DesignConfig, candidates_of_config, candidates_of_dataset
 from omnibench.design.design import Design, design_experiment
 from omnibench.design.report import design_document

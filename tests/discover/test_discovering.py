@@ -25,10 +25,8 @@ from omnibench.discover.result import Discovery
 from omnibench.discover.selection.model_selection import Screening, Selection
 from omnibench.errors import DataError, UnknownNameError
 from omnibench.fit.evaluate import evaluate
-from omnibench.fit.trajectory_fit import Given
 from omnibench.progress import Progress
 from omnibench.report.render import render
-from omnibench.robot.odometry import OdometryBatch
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import read_simulation, simulate_dataset, simulate_like
 
@@ -144,21 +142,7 @@ def test_the_runs_that_are_proposed_tell_the_class_apart_together_with_the_recor
     assert found.effects[0].weight >= 0.95
 
 
-def test_steps_come_in_order_confirming_only_with_an_effect_and_what_concludes_fits_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    conclude = discover.conclude
-
-    def refuse(*_: Any) -> None:
-        raise AssertionError("fitted while concluding")
-
-    def conclude_without_fits(*args: Any) -> Discovery:
-        with monkeypatch.context() as patch:
-            patch.setattr(Given, "estimate", refuse)
-            patch.setattr(OdometryBatch, "jacobian", refuse)
-            return conclude(*args)
-
-    monkeypatch.setattr(discover, "conclude", conclude_without_fits)
+def test_steps_come_in_order_confirming_only_with_an_effect() -> None:
     with_effect: list[Progress] = []
     without_effect: list[Progress] = []
     assert discover.discover_effects(simulated(commands=SMALL), watch=with_effect.append).verdict == "named"

@@ -22,7 +22,7 @@ from named_constants import Constant, constants_of, modules_of
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
-from omnibench.discover.discover import Request, discover_effects
+from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery
 from omnibench.processes import one_thread
 
@@ -161,7 +161,7 @@ def _key(argument: Any) -> object:
         return argument.name, tuple(argument.shapes.items()), tuple(each.name for each in argument.parameters)
     if isinstance(argument, np.ndarray):
         return argument.tobytes()
-    return argument if isinstance(argument, str | float | int | Request) else id(argument)
+    return argument if isinstance(argument, str | float | int) else id(argument)
 
 
 def study(one: Set, varied: Sequence[Constant], done: set[tuple[str, str, float]]) -> Iterator[Result]:

@@ -17,11 +17,10 @@ from hidden.forms import FORMS
 from hidden.outside import OUTSIDE
 from hidden.sets import make_set
 
-from omnibench.discover import covariate_dependence
-from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting import fit_matrix
 from omnibench.discover.regressors.significance import Significance, significance_of
-from omnibench.discover.selection.model_selection import CHANCE, screen_plain
+from omnibench.discover.selection import model_selection
+from omnibench.discover.selection.model_selection import CHANCE, screen_plain, weights_of_covariates
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
@@ -52,11 +51,11 @@ def main() -> None:
     parser.add_argument("--levels", type=float, nargs="+", default=[150.0, 1000.0])
     parser.add_argument("--factors", type=float, nargs="+", default=[0.5, 1.0, 1.5])
     arguments = parser.parse_args()
-    usual = covariate_dependence._DISCREPANCY
+    usual = model_selection._OF_BASES
     with one_thread():
         sets = list(seen(arguments.levels))
     for factor in arguments.factors:
-        covariate_dependence._DISCREPANCY = factor * usual
+        model_selection._OF_BASES = factor * usual
         answers = []
         for name, right, found in sets:
             weights = weights_of_covariates(found)

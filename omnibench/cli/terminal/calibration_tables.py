@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console, RenderableType
 
 from omnibench.cli.terminal.console import print_ending
@@ -18,7 +17,6 @@ from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.certify import QUADRATURE, CertifiedCalibration
 from omnibench.fit.evaluate import Evaluation
 from omnibench.fit.path_errors import PathError
-from omnibench.fit.uncertainty import ElementIntervals
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.calibration_report import parameter_table, path_table
 from omnibench.report.numbers import noise_in_words
@@ -39,33 +37,28 @@ def print_certificate(console: Console, certified: CertifiedCalibration) -> None
     """Print a calibration's cost, its proven lower bound and what that means."""
     certificate, proof = certified.certificate, certified.proof
     kind = "simulated data" if certified.dataset.simulated else "recorded data"
-    console.print(f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}", soft_wrap=True)
-    if certificate.shrinking is None:
-        console.print(f"cost of the calibration      {certificate.cost:.9f}")
-    else:
-        console.print(f"cost of the calibration      {certificate.cost * (1 + certificate.shrinking):.9f}")
-        console.print(f"optimum of the matrix alone  {certificate.cost:.9f}")
-        console.print(
-            f"The calibration weighs the design, or has effects: its cost differs by {certificate.shrinking:+.2%}.",
-            soft_wrap=True,
-        )
+    lines = [f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}"]
+    lines.append(f"cost of the calibration      {certificate.cost * (1 + (certificate.shrinking or 0.0)):.9f}")
+    if certificate.shrinking is not None:
+        lines.append(f"optimum of the matrix alone  {certificate.cost:.9f}")
+        differs = f"its cost differs by {certificate.shrinking:+.2%}."
+        lines.append(f"The calibration weighs the design, or has effects: {differs}")
     if proof.best_cost < certificate.cost:
-        console.print(f"best matrix seen in the box  {proof.best_cost:.9f}")
-    console.print(f"proven lower bound           {certificate.lower_bound:.9f}")
+        lines.append(f"best matrix seen in the box  {proof.best_cost:.9f}")
+    lines.append(f"proven lower bound           {certificate.lower_bound:.9f}")
     if certificate.cost < QUADRATURE:
-        console.print(f"There is nothing to gain: what is left is rounding (below {QUADRATURE:g}).", soft_wrap=True)
+        lines.append(f"There is nothing to gain: what is left is rounding (below {QUADRATURE:g}).")
     else:
-        console.print(
+        lines.append(
             f"No matrix in the box {certificate.box!r} costs less than that: whatever the optimiser, there is at most "
-            f"{max(certificate.gap, 0.0):.3%} to gain on this calibration.",
-            soft_wrap=True,
+            f"{max(certificate.gap, 0.0):.3%} to gain on this calibration."
         )
     if certified.held:
-        console.print(f"The box holds {', '.join(certified.held)} at the design value.", soft_wrap=True)
+        lines.append(f"The box holds {', '.join(certified.held)} at the design value.")
     ended = "" if proof.finished else "; with more (--seconds, --parts) the bound may rise"
-    console.print(
-        f"{plural(proof.boxes, 'part')} of the box examined in {certificate.seconds:.1f} s{ended}", soft_wrap=True
-    )
+    lines.append(f"{plural(proof.boxes, 'part')} of the box examined in {certificate.seconds:.1f} s{ended}")
+    for line in lines:
+        console.print(line, soft_wrap=True)
 
 
 def print_calibration(console: Console, run: CalibrationRun, others: Sequence[str] = (), last: str = "") -> bool:
@@ -86,16 +79,17 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
         room -= _height(console, parameters)
 
     # The matrix with its intervals, if all else has room then; without; its elements alone; or where it is.
-    forms: list[RenderableType] = [
-        render_table(_matrix_table(run, intervals=intervals), console.width) for intervals in (True, False)
-    ]
-    elements = list(_elements(run.calibration))
+    calibration, names = run.calibration, run.calibration.robot.drive.names
+    tables = [render_table(_matrix_table(run, intervals=shown), console.width) for shown in (True, False)]
+    forms = [(tables[0], lines), (tables[1], [])]
+    width = max(11, *(len(name) + 1 for name in names))
+    elements = [f"{'matrix':12}{''.join(f'{name:>{width}}' for name in names)}"]
+    for label, row in zip(_ROWS, calibration.matrix, strict=True):
+        elements.append(f"{label:12}{''.join(f'{value:+{width}.7f}' for value in row)}")
     if max(map(len, elements)) <= console.width:
-        forms.append("\n".join(elements))
-    forms.append(f"matrix (3 x {len(run.calibration.matrix[0])}): not on this screen; --json shows it, -o writes it")
-    heights = [_height(console, forms[0], *lines), *(_height(console, form) for form in forms[1:])]
-    fitting = [form for form, height in zip(forms, heights, strict=True) if height <= room]
-    matrix = next(iter(fitting), forms[-1])
+        forms.append(("\n".join(elements), []))
+    place = f"matrix (3 x {len(names)}): not on this screen; --json shows it, -o writes it"
+    matrix = next((form for form, rest in forms if _height(console, form, *rest) <= room), place)
     console.print(matrix, soft_wrap=isinstance(matrix, str))
     room -= _height(console, matrix)
     for line in lines:
@@ -103,15 +97,6 @@ def print_calibration(console: Console, run: CalibrationRun, others: Sequence[st
             console.print(line, soft_wrap=True)
             room -= _height(console, line)
     return _height(console, last) <= room
-
-
-def _elements(calibration: Calibration) -> Iterator[str]:
-    """The elements of a matrix in four lines."""
-    names = calibration.robot.drive.names
-    width = max(11, *(len(name) + 1 for name in names))
-    yield f"{'matrix':12}{''.join(f'{name:>{width}}' for name in names)}"
-    for label, row in zip(_ROWS, calibration.matrix, strict=True):
-        yield f"{label:12}{''.join(f'{value:+{width}.7f}' for value in row)}"
 
 
 def _height(console: Console, *shown: RenderableType) -> int:
@@ -132,47 +117,38 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
 
     It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
     """
-    calibration = run.calibration
-    touched = np.any([np.abs(each.rates) > _TOUCHED for each in run.kept], axis=0) if run.kept else []
-    marks = ["*" if touch else "" for touch in touched] or [""] * len(calibration.matrix[0])
-    notes, listed = [], list[tuple[str, ElementIntervals]]()
-    if run.uncertainty is not None and intervals:
-        listed.append(("95 %", run.uncertainty.intervals))
+    calibration, drive = run.calibration, run.calibration.robot.drive
+    known = run.uncertainty.intervals if run.uncertainty is not None and intervals else None
+    notes = []
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
-        notes.append(only if listed else f"the design values are kept along {motions}, of which these data say nothing")
-    if stopped := [*run.untouched, *run.result.at_bounds] if listed else []:
+        without = f"the design values are kept along {motions}, of which these data say nothing"
+        notes.append(without if known is None else only)
+    if known is not None and (stopped := [*run.untouched, *run.result.at_bounds]):
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
-    drive = calibration.robot.drive
     deviations = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
-    signals = [f"wheel {name}" if drive.direct else name for name in drive.names]
-    values = _cells(
-        [
-            [Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(row, shares, strict=True)]
-            for row, shares in zip(calibration.matrix, deviations, strict=True)
-        ]
-    )
-    bounds = [
-        (name, _cells([[Cell("", _interval(*each)) for each in zip(*row, marks, strict=True)] for row in ends]))
-        for name, ends in ((name, zip(each.low, each.high, strict=True)) for name, each in listed)
+    values = [
+        [Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(*of_row, strict=True)]
+        for of_row in zip(calibration.matrix, deviations, strict=True)
     ]
-    turned = len(signals) > _COLUMNS
-    headings, lines = (_ROWS, signals) if turned else (signals, _ROWS)
-    rows = []
-    for number, label in enumerate(lines):
-        rows.append(Row.of(label, *(values.T if turned else values)[number]))
-        rows += [Row.of(f"  {name}", *(cells.T if turned else cells)[number]) for name, cells in bounds]
+    labelled = [("", values)]
+    if known is not None:
+        touched = np.any([np.zeros(len(drive.names)), *(np.abs(each.rates) > _TOUCHED for each in run.kept)], axis=0)
+        marks = ["*" if touch else "" for touch in touched]
+        bounds = [
+            [Cell("", _interval(*each)) for each in zip(*of_row, marks, strict=True)]
+            for of_row in zip(known.low, known.high, strict=True)
+        ]
+        labelled.append(("  95 %", bounds))
+    headings: Sequence[str] = [f"wheel {name}" if drive.direct else name for name in drive.names]
+    labels: Sequence[str] = _ROWS
+    if len(headings) > _COLUMNS:
+        headings, labels = labels, headings
+        labelled = [(name, [list(column) for column in zip(*cells, strict=True)]) for name, cells in labelled]
+    rows = [Row.of(name or label, *cells[n]) for n, label in enumerate(labels) for name, cells in labelled]
     columns = (Column("matrix", numeric=False), *map(Column, headings))
     return Table("" if run.parameters else _title(run), columns, tuple(rows), "; ".join(notes))
-
-
-def _cells(rows: Sequence[Sequence[Cell]]) -> npt.NDArray[np.object_]:
-    """Cells as an array (3, M), which can be turned."""
-    table = np.empty((len(rows), len(rows[0])), dtype=object)
-    for number, row in enumerate(rows):
-        table[number] = row
-    return table
 
 
 def _interval(low: float, high: float, mark: str) -> str:
@@ -196,15 +172,12 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
             title += f", {100 * outside:.0f} % of the time outside of what it was fitted to"
         rows.append(Row.of(title, role="group"))
         for label, errors in (("calibration", evaluation.splits[split]), ("design", evaluation.design[split])):
-            figures = (
-                f"{errors.cost:.4f}",
-                *("" if each is None else f"{each:.4f}" for each in (errors.position_mean_m, errors.position_max_m)),
-                *(
-                    "" if each is None else f"{math.degrees(each):.2f}"
-                    for each in (errors.heading_mean_rad, errors.heading_max_rad)
-                ),
+            position = (
+                "" if each is None else f"{each:.4f}" for each in (errors.position_mean_m, errors.position_max_m)
             )
-            rows.append(Row.of(label, *figures))
+            angles = (errors.heading_mean_rad, errors.heading_max_rad)
+            heading = ("" if each is None else f"{math.degrees(each):.2f}" for each in angles)
+            rows.append(Row.of(label, f"{errors.cost:.4f}", *position, *heading))
     columns = (
         Column("model", numeric=False),
         Column("error, Eq. (6)"),
@@ -214,16 +187,10 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; the errors are without it" if evaluation.loss else ""
     print_table(console, Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note))
-    _print_reference_errors(console, evaluation)
-
-
-def _print_reference_errors(console: Console, evaluation: Evaluation) -> None:
-    """Print the errors at references other than poses, by kind, of the calibration and of the design values."""
+    # The errors at references other than poses, by kind.
     rows = []
     for split, errors in evaluation.splits.items():
-        if not errors.references:
-            continue
-        rows.append(Row.of(split, role="group"))
+        rows += [Row.of(split, role="group")] if errors.references else []
         for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
             sizes = (
                 _size(each, of_model.unit) for of_model in (fitted, before) for each in (of_model.mean, of_model.max)

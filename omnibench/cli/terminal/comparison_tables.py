@@ -106,12 +106,9 @@ def _methods(result: StudyResult) -> Table:
             mean = mean_ratio(ratios)
             cells.append(silent if mean is None else Cell(fixed(mean, 2), plural(len(ratios), "cell")))
         rows.append(Row.of(method, *cells))
-    return Table(
-        "Error as a share of the design's, geometric mean over cells",
-        (Column("Method", numeric=False), *(Column(name) for name in robots)),
-        tuple(rows),
-        "Every cell and method, with reasons: report.html and study.parquet.",
-    )
+    caption = "Error as a share of the design's, geometric mean over cells"
+    columns = (Column("Method", numeric=False), *map(Column, robots))
+    return Table(caption, columns, tuple(rows), "Every cell and method, with reasons: report.html and study.parquet.")
 
 
 def _cells(result: StudyResult) -> Table:
@@ -122,30 +119,14 @@ def _cells(result: StudyResult) -> Table:
     for cell in result.judged_cells:
         answered = [each for each in cell.methods.values() if each.errors is not None]
         best = min(answered, key=lambda each: each.mean("cost") or 0.0, default=None)
-        ours = cell.methods.get(reference or "")
-        mean = None if ours is None else ours.mean("cost")
-        beside = ratios.get(id(cell))
-        rows.append(
-            Row.of(
-                cell.key.robot,
-                cell_words(cell),
-                fixed(float(cell.design["cost"].mean()), 4),
-                NOTHING if best is None else f"{fixed(best.mean('cost'), 4)} {best.method}",
-                fixed(mean, 4),
-                NOTHING if beside is None else f"{fixed(beside.ratio.value, 2)} {beside.best}",
-                NOTHING if beside is None else beside.ratio.verdict,
-            )
-        )
-    return Table(
-        "Mean error of runs that did not train, Eq. (6)",
-        (
-            Column("Robot", numeric=False),
-            Column("Training → judged", numeric=False),
-            Column("Design"),
-            Column("Least", numeric=False),
-            Column(reference or "Reference"),
-            Column("Beside the best published", numeric=False),
-            Column("Verdict", numeric=False),
-        ),
-        tuple(rows),
-    )
+        ours, beside = cell.methods.get(reference or ""), ratios.get(id(cell))
+        figures = [fixed(float(cell.design["cost"].mean()), 4)]
+        figures.append(NOTHING if best is None else f"{fixed(best.mean('cost'), 4)} {best.method}")
+        figures.append(fixed(None if ours is None else ours.mean("cost"), 4))
+        figures.append(NOTHING if beside is None else f"{fixed(beside.ratio.value, 2)} {beside.best}")
+        verdict = NOTHING if beside is None else beside.ratio.verdict
+        rows.append(Row.of(cell.key.robot, cell_words(cell), *figures, verdict))
+    words = ("Robot", "Training → judged", "Least", "Beside the best published", "Verdict")
+    robot, cells, least, published, shown = (Column(title, numeric=False) for title in words)
+    columns = (robot, cells, Column("Design"), least, Column(reference or "Reference"), published, shown)
+    return Table("Mean error of runs that did not train, Eq. (6)", columns, tuple(rows))

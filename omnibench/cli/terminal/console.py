@@ -6,6 +6,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -65,6 +66,13 @@ def warn(messages: Iterable[str]) -> None:
 def say(text: str) -> None:
     """Running text on standard output, wrapped between words on a terminal and as one line in a pipe."""
     make_console().print(text, soft_wrap=True)
+
+
+def print_names(summaries: Mapping[str, str], width: int) -> None:
+    """A line for each name, with its summary, wrapped beside a column of names of so many characters."""
+    for name, summary in summaries.items():
+        head, hang = f"  {name:{width}}", " " * (width + 2)
+        typer.echo(fill(summary, make_console().width, initial_indent=head, subsequent_indent=hang))
 
 
 def print_json(document: Mapping[str, Any] | BaseModel) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
 from omnibench.registry import importers
 
@@ -35,30 +34,17 @@ def importer_help(name: str, command: str) -> str:
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Paragraphs wrapped to a width; indented lines as they are, as far as they fit."""
+    """Paragraphs wrapped to a width; indented ones line by line, with what is indented more behind the line before."""
     lines: list[str] = []
     for paragraph in text.split("\n\n"):
-        rows = paragraph.split("\n")
-        if lines:
-            lines.append("")
-        if rows[0].startswith("    "):
-            for row in _entries(rows):
-                hang = 4 + (len(row[4:]) - len(re.sub(r"^\S.*?  +", "", row[4:])))
-                lines += textwrap.wrap(row, width, subsequent_indent=" " * min(hang, 24), drop_whitespace=True)
+        lines += [""] if lines else []
+        if paragraph.startswith("    "):
+            for row in re.sub(r"\n {5,}", " ", paragraph).split("\n"):
+                head = re.match(r" {4}\S.*?  +", row)
+                lines += textwrap.wrap(row, width, subsequent_indent=" " * min(len(head[0]) if head else 4, 24))
         else:
-            lines += textwrap.wrap(" ".join(rows), width)
+            lines += textwrap.wrap(" ".join(paragraph.split("\n")), width)
     return lines
-
-
-def _entries(rows: list[str]) -> list[str]:
-    """Indented rows, each with the more indented ones that go on with it."""
-    entries: list[str] = []
-    for row in rows:
-        if entries and len(row) - len(row.lstrip()) > 4:
-            entries[-1] = f"{entries[-1]} {row.strip()}"
-        else:
-            entries.append(row)
-    return entries
 
 
 def _groups(options: type[BaseModel]) -> dict[str, dict[str, FieldInfo]]:
@@ -78,25 +64,22 @@ def _option(
     key: str, field: FieldInfo, schema: dict[str, Any], definitions: dict[str, Any], width: int
 ) -> Iterator[str]:
     """Key, type and default on a line, and what the option says below."""
-    default = "   default: as its folder is called" if key == "name" else _default(field)
-    kind = ", ".join(dict.fromkeys(_kinds(schema, definitions)))
-    yield from textwrap.wrap(f"  {key}  {kind}{default}", width, subsequent_indent=" " * 6, break_on_hyphens=False)
-    if field.description:
-        yield from textwrap.wrap(
-            field.description, width, initial_indent=" " * 6, subsequent_indent=" " * 6, break_on_hyphens=False
-        )
-
-
-def _default(field: FieldInfo) -> str:
-    if field.is_required():
-        return "   must be given"
-    default = field.get_default(call_default_factory=True)
-    if default is PydanticUndefined or default in (None, (), {}, "") or isinstance(default, BaseModel):
-        return ""
-    if isinstance(default, tuple | list):
-        return f"   default [{','.join(map(str, default))}]"
+    default = schema.get("default")
     shown = f"{default:g}" if isinstance(default, float) else str(default)
-    return f"   default {shown.lower() if isinstance(default, bool) else shown}"
+    if key == "name":
+        ending = "   default: as its folder is called"
+    elif field.is_required():
+        ending = "   must be given"
+    elif isinstance(default, list) and default:
+        ending = f"   default [{','.join(map(str, default))}]"
+    elif default in (None, "", []) or isinstance(default, dict):
+        ending = ""
+    else:
+        ending = f"   default {shown.lower() if isinstance(default, bool) else shown}"
+    indent, kind = " " * 6, ", ".join(dict.fromkeys(_kinds(schema, definitions)))
+    yield from textwrap.wrap(f"  {key}  {kind}{ending}", width, subsequent_indent=indent, break_on_hyphens=False)
+    said = textwrap.TextWrapper(width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    yield from said.wrap(field.description or "")
 
 
 def _kinds(schema: dict[str, Any], definitions: dict[str, Any]) -> Iterator[str]:
@@ -120,13 +103,10 @@ def _kinds(schema: dict[str, Any], definitions: dict[str, Any]) -> Iterator[str]
     elif schema.get("type") == "object":
         yield "{key: value}"
     elif schema.get("type") in _NAMES:
-        yield _NAMES[schema["type"]] + _bound(schema)
+        least = f" >= {schema['minimum']:g}" if "minimum" in schema else ""
+        if "exclusiveMinimum" in schema and "exclusiveMaximum" not in schema:
+            least = f" > {schema['exclusiveMinimum']:g}"
+        yield _NAMES[schema["type"]] + least
 
 
 _NAMES = {"string": "text", "number": "number", "integer": "whole number", "boolean": "true or false"}
-
-
-def _bound(schema: dict[str, Any]) -> str:
-    if "exclusiveMinimum" in schema and "exclusiveMaximum" not in schema:
-        return f" > {schema['exclusiveMinimum']:g}"
-    return f" >= {schema['minimum']:g}" if "minimum" in schema else ""

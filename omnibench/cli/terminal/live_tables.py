@@ -65,30 +65,25 @@ def node_log(console: Console, warnings_only: bool = False) -> Iterator[logging.
 
 def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
     """Print how much of a recording was played, and how long it took."""
-    kind = "simulated" if simulated else "recorded"
+    sent, delivered = sum(report.sent.values()), "delivery not confirmed, since no omnibench node runs the robot"
+    if report.taken is not None:
+        again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
+        share = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
+        delivered = f"{share} taken by the node{again}"
     console.print(
-        f"{plural(report.sent['joint_states'], 'wheel sample')} and "
-        f"{plural(report.sent['slam_pose'], 'SLAM pose')} ({kind}), "
-        f"{report.data_seconds:.1f} s of the drive in {report.wall_seconds:.1f} s; {_delivered(report)}",
+        f"{plural(report.sent['joint_states'], 'wheel sample')} and {plural(report.sent['slam_pose'], 'SLAM pose')} "
+        f"({'simulated' if simulated else 'recorded'}), {report.data_seconds:.1f} s of the drive in "
+        f"{report.wall_seconds:.1f} s; {delivered}",
         soft_wrap=True,
     )
     if not report.complete:
-        console.print(f"stopped after {sum(report.sent.values())} of {plural(report.total, 'message')}", soft_wrap=True)
+        console.print(f"stopped after {sent} of {plural(report.total, 'message')}", soft_wrap=True)
 
 
 def print_counted(console: Console, report: PlayReport) -> None:
     """Print what the node could not use of what it took, or of what others sent it meanwhile."""
     if report.anomalies:
         console.print(f"meanwhile the node counted {anomalies_in_words(report.anomalies)}", soft_wrap=True)
-
-
-def _delivered(report: PlayReport) -> str:
-    """How many of the messages sent are known to have arrived."""
-    if report.taken is None:
-        return "delivery not confirmed, since no omnibench node runs the robot"
-    sent = sum(report.sent.values())
-    again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
-    return f"{'all' if report.taken == sent else f'{report.taken:,} of {sent:,}'} taken by the node{again}"
 
 
 def print_demonstration(console: Console, shown: Demonstration) -> None:
@@ -101,17 +96,14 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
         (f"odom: {shown.calibration}", shown.calibrated),
         ("odometry/filtered: fused with SLAM", shown.fused),
     )
-    rows = (
-        Row.of(label, _figure(of.position, 4), _figure(math.degrees(of.heading), 2), _figure(of.final_position, 4))
-        for label, of in estimates
-        if of is not None
-    )
-    columns = (
-        Column("estimate", numeric=False),
-        Column("position, RMS", "m"),
-        Column("heading, RMS", "deg"),
-        Column("position at the end", "m"),
-    )
+    rows = []
+    for label, errors in estimates:
+        if errors is not None:
+            figures = ((errors.position, 4), (math.degrees(errors.heading), 2), (errors.final_position, 4))
+            # NaN: nothing was compared yet
+            rows.append(Row.of(label, *("–" if math.isnan(value) else f"{value:.{n}f}" for value, n in figures)))
+    numeric = (Column("position, RMS", "m"), Column("heading, RMS", "deg"), Column("position at the end", "m"))
+    columns = (Column("estimate", numeric=False), *numeric)
     print_table(console, Table(f"{shown.robot} against {shown.against}", columns, tuple(rows)))
     console.print(
         f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",
@@ -119,10 +111,6 @@ def print_demonstration(console: Console, shown: Demonstration) -> None:
     )
     counts = {name: value for name, value in shown.health.counts.items() if value}
     console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
-
-
-def _figure(value: float, decimals: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{decimals}f}"  # nothing was compared yet
 
 
 _PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen
@@ -167,27 +155,20 @@ def record(
     status.keep(f"{path}: {_figures(recorder, seconds_recorded)}")
     missed = recorder.missed
     for name in sorted(recorder.counts.keys() | recorder.undecodable.keys() | missed.keys()):
-        others = f"{_left_out(recorder.undecodable[name])}{_missed(missed[name])}"
-        status.keep(f"  {name}: {recorder.counts[name]:,}{others}")
+        status.keep(f"  {name}: {recorder.counts[name]:,}{_lacking(recorder.undecodable[name], missed[name])}")
     return recorder
 
 
 def _figures(recorder: Recorder, seconds: float) -> str:
     """Messages and bytes that were recorded in ``seconds``."""
     lost = f", {recorder.lost:,} lost because the disk was too slow" if recorder.lost else ""
-    missed = _missed(recorder.missed.total())
-    return (
-        f"{seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB"
-        f"{_left_out(recorder.undecodable.total())}{missed}{lost}"
-    )
+    lacking = _lacking(recorder.undecodable.total(), recorder.missed.total())
+    return f"{seconds:.1f} s, {plural(recorder.messages, 'message')}, {recorder.bytes / 1e6:.2f} MB{lacking}{lost}"
 
 
-def _missed(messages: int) -> str:
-    return f", {messages:,} missed on the way" if messages else ""
-
-
-def _left_out(undecodable: int) -> str:
-    return f", {undecodable:,} left out that could not be decoded" if undecodable else ""
+def _lacking(undecodable: int, missed: int) -> str:
+    left_out = f", {undecodable:,} left out that could not be decoded" if undecodable else ""
+    return left_out + (f", {missed:,} missed on the way" if missed else "")
 
 
 _REFRESH: Final = 0.2  # s between two drawings of the table; chosen
@@ -249,54 +230,59 @@ def view(statuses: Sequence[RobotStatus], console: Console) -> RenderableType:
     figures = render_table(_table(statuses, health=False), console.width)
     if console.measure(figures).maximum + _HEALTH_WIDTH <= console.width:
         return render_table(_table(statuses, health=True), console.width)
-    return Group(
-        figures,
-        *(
-            Text(f"{status.robot}: {describe(status)}", style="dim" if status.presence == "left" else "")
-            for status in statuses
-        ),
-    )
+    lines = [
+        Text(f"{status.robot}: {describe(status)}", style="dim" if status.presence == "left" else "")
+        for status in statuses
+    ]
+    return Group(figures, *lines)
 
 
 def describe(status: RobotStatus) -> str:
     """A robot's presence and health in words."""
-    parts = []
-    if status.presence == "left":
-        parts.append("left")
-    streams = _streams(status)
+    left, streams = status.presence == "left", _streams(status)
     silence = min((stream.age for stream in streams), default=None)
+    parts = ["left"] if left else []
     if silence is None:
         parts.append("no odometry yet")
     elif silence >= _SILENCE:
         parts.append(f"no message for {silence:.1f} s")
-    elif status.health is None and status.presence != "left":
+    elif status.health is None and not left:
         parts.append("health unknown")
-    if status.health is not None and status.presence != "left":
+    if status.health is not None and not left:
         message = status.health.message
         parts.append(status.health.status + (f": {message}" if message not in ("", status.health.status) else ""))
-        parts.extend(f"{name} {count}" for name, count in status.health.counts.items())
-    undecodable = sum(stream.undecodable for stream in streams)
-    if undecodable:
+        parts += [f"{name} {count}" for name, count in status.health.counts.items()]
+    if undecodable := sum(stream.undecodable for stream in streams):
         parts.append(f"undecodable odometry {undecodable}")
-    missed = sum(stream.missed for stream in streams)
-    if missed:
+    if missed := sum(stream.missed for stream in streams):
         parts.append(f"{plural(missed, 'message')} missed on the way")
     return one_line(", ".join(parts))
 
 
 def plain_line(status: RobotStatus) -> str:
     """A robot's state as one line of text."""
-    return "; ".join([f"{status.robot}: {describe(status)}", *map(_plain_odometry, _streams(status))])
+    parts = [f"{status.robot}: {describe(status)}"]
+    for stream in _streams(status):
+        x, y, heading = stream.message.pose.tolist()
+        vx, vy, w = stream.message.twist.tolist()
+        rate = "" if stream.rate is None else f", {stream.rate:.1f} Hz"
+        by_stamp = "" if stream.stamp_age is None else f" ({stream.stamp_age * 1e3:.0f} ms by its stamp)"
+        parts.append(
+            f"{stream.message.frame} x {x:.3f} m y {y:.3f} m heading {math.degrees(heading):.1f} deg (1 sigma "
+            f"{stream.position_sigma:.3f} m {math.degrees(stream.heading_sigma):.2f} deg) vx {vx:.3f} m/s vy {vy:.3f} "
+            f"m/s w {math.degrees(w):.1f} deg/s{rate}, age {stream.age * 1e3:.0f} ms{by_stamp}"
+        )
+    return "; ".join(parts)
 
 
 def _table(statuses: Sequence[RobotStatus], health: bool) -> Table:
     rows = []
     for status in statuses:
+        role: RowRole = "muted" if status.presence == "left" else "plain"
+        names, words = [status.robot, ""], [describe(status), ""]  # in the first line of a robot
         for number, stream in enumerate(_streams(status) or (None,)):
-            words = [describe(status) if number == 0 else ""] if health else []
-            name = status.robot if number == 0 else ""
-            role: RowRole = "muted" if status.presence == "left" else "plain"
-            rows.append(Row.of(name, *_cells(status.robot, stream, by_stamp=health), *words, role=role))
+            ending = [words[number]] if health else []
+            rows.append(Row.of(names[number], *_cells(status.robot, stream, by_stamp=health), *ending, role=role))
     return Table("", _COLUMNS if health else _COLUMNS[:-1], tuple(rows))
 
 
@@ -331,15 +317,3 @@ def _digits(value: float, decimals: int) -> str:
 
 def _streams(status: RobotStatus) -> tuple[OdometryStatus, ...]:
     return tuple(stream for stream in (status.odom, status.filtered) if stream is not None)
-
-
-def _plain_odometry(stream: OdometryStatus) -> str:
-    x, y, heading = stream.message.pose.tolist()
-    vx, vy, w = stream.message.twist.tolist()
-    rate = "" if stream.rate is None else f", {stream.rate:.1f} Hz"
-    by_stamp = "" if stream.stamp_age is None else f" ({stream.stamp_age * 1e3:.0f} ms by its stamp)"
-    return (
-        f"{stream.message.frame} x {x:.3f} m y {y:.3f} m heading {math.degrees(heading):.1f} deg"
-        f" (1 sigma {stream.position_sigma:.3f} m {math.degrees(stream.heading_sigma):.2f} deg)"
-        f" vx {vx:.3f} m/s vy {vy:.3f} m/s w {math.degrees(w):.1f} deg/s{rate}, age {stream.age * 1e3:.0f} ms{by_stamp}"
-    )

@@ -43,10 +43,15 @@ def render_table(table: Table, width: int) -> RenderableType:
         if row.role == "group":
             lines = _lines(table, layout, heading=False)
             parts += [Text(row.cells[0].text, style="bold dim"), lines]
-        else:
-            lines.add_row(
-                *(_text(row.cells[index], layout, index) for index in layout.widths), style=_STYLES.get(row.role)
-            )
+            continue
+        cells = []
+        for index, room in layout.widths.items():
+            cell = row.cells[index]
+            text = Text("\n".join(_wrapped(part, room) for part in _parts(cell, layout.notes)))
+            if cell.note:
+                text.stylize(_SMALL, len(_wrapped(cell.text, room)))
+            cells.append(text)
+        lines.add_row(*cells, style=_STYLES.get(row.role))
     if left_out := [_heading(column) for index, column in enumerate(table.columns) if index not in layout.widths]:
         words = f"left out for want of room: {', '.join(left_out)}; {layout.needed} columns show all"
         parts.append(Text(words, style=_SMALL))
@@ -146,15 +151,6 @@ def _parts(cell: Cell, notes: Place) -> list[str]:
     return [part for part in (cell.text, cell.note) if part]
 
 
-def _text(cell: Cell, layout: _Layout, index: int) -> Text:
-    """A cell in lines that fit its column, with its note in small print."""
-    lines = [_wrapped(part, layout.widths[index]) for part in _parts(cell, layout.notes)]
-    text = Text("\n".join(lines))
-    if cell.note:
-        text.stylize(_SMALL, len(_wrapped(cell.text, layout.widths[index])))
-    return text
-
-
 def _wrapped(text: str, width: int) -> str:
     """A text in lines; a path that is longer than a line breaks behind a slash."""
     tied = re.sub(rf"\S{{{width + 1},}}", lambda path: path[0].replace("/", "/\v"), _tied(text))
@@ -173,10 +169,6 @@ def _lines(table: Table, layout: _Layout, heading: bool) -> Lines:
     lines = Lines(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=padding, show_header=heading)
     for index, width in layout.widths.items():
         column = table.columns[index]
-        lines.add_column(
-            _wrapped(_heading(column), width) if heading else "",
-            justify="right" if column.numeric else "left",
-            width=width,
-            overflow="fold",
-        )
+        title = _wrapped(_heading(column), width) if heading else ""
+        lines.add_column(title, justify="right" if column.numeric else "left", width=width, overflow="fold")
     return lines

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from omnibench.discover.report import tables
-from omnibench.discover.report.evidence_figures import CANDIDATES, GAPS, drawn, hidden_grid
+from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
 from omnibench.discover.report.residuals import ALONE, EXTENDED, PLAIN
 from omnibench.discover.report.where_section import where_section
 from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
@@ -87,7 +87,7 @@ def _cause(discovery: Discovery) -> tuple[str, str]:
         unnamed = " and of the gap an unnamed term closes what is shown" if discovery.extends else ""
         return discovery.verdict, f"{verdict}{unnamed}"
     first, *more = discovery.effects
-    others = [name for name in first.confusable_with if name != first.name]
+    others = first.confusable_with
     name = first.name.replace("_", " ")
     name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
     name += f", and {len(more)} more" if more else ""
@@ -132,9 +132,9 @@ def what_blocks(discovery: Discovery) -> Iterator[page.Block]:
 
 def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
     yield effect.physics
-    others = [name for name in effect.confusable_with if name != effect.name]
-    if others:
-        yield f"These data cannot tell it from {listing(others)}: any of them closes the gap as well."
+    if effect.confusable_with:
+        others = listing(list(effect.confusable_with))
+        yield f"These data cannot tell it from {others}: any of them closes the gap as well."
     if effect.in_doubt:
         yield f"In doubt: {effect.in_doubt}."
     if effect.source:
@@ -156,7 +156,7 @@ def sure_blocks(discovery: Discovery) -> Iterator[page.Block]:
             ),
             "tiles",
         )
-    yield from drawn(CANDIDATES, discovery)
+    yield from filter(None, [candidate_grid(discovery)])
     if discovery.left:
         caption = "What the residuals still depend on, after all that was added"
         yield tables.dependence_table(discovery.left, caption)
@@ -180,7 +180,7 @@ def _how_much_better(discovery: Discovery) -> Iterator[page.Block]:
     """The gain: errors before and after against the noise floor, on held-out runs."""
     if discovery.held_out:
         yield page.Paragraph(_better_in_words(discovery))
-    yield from drawn(GAPS, discovery)
+    yield from filter(None, [gap_grid(discovery), waterfall_grid(discovery)])
     yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
     if len(discovery.steps) > 1:
         yield page.Details("Every step in numbers", (tables.step_table(discovery),))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,7 +20,6 @@ from omnibench.report.style import INK, QUIET, logarithmic, plan, plot, text, wr
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
-EvidenceFigure = Callable[[Discovery], FigureGrid | None]
 _NAME = 20  # characters of a line of an effect's name
 _CANDIDATES = 8  # shown of each step, at most; only the drawing hangs on it
 _CHOSEN, _UNCHOSEN = LegendItem("chosen", "added", fits.AFTER), LegendItem("other", "not added", "#b9c0c8")
@@ -124,29 +123,25 @@ def waterfall_grid(discovery: Discovery) -> FigureGrid | None:
     unseen = held is not None and all(step.eq6_held_out is not None and step.held_out is not None for step in steps)
     if unseen and held is not None:
         where = tables.held_out_in_words(discovery, held)
-        values = [[step.eq6_held_out for step in steps], [step.held_out for step in steps]]
+        after_each = [(step.eq6_held_out, step.held_out) for step in steps]
         floors: list[float | None] = [held.eq6.floor, held.chi2.floor]
     else:
         where, gap = "training runs", discovery.gap
-        values = [[step.eq6_train for step in steps], [step.train for step in steps]]
+        after_each = [(step.eq6_train, step.train) for step in steps]
         floors = [gap.floor if gap.metric == metric and not discovery.held_out else None for metric in tables.METRICS]
+    values = [[value for value in own if value is not None] for own in zip(*after_each, strict=True)]
     figures = tuple(
         Figure(
             f"{title}, {where}",
-            _waterfall(steps, [value for value in own if value is not None], floor, title),
+            _waterfall(steps, own, floor, title),
             f"{title} of the plain matrix and after each effect that was added, {where}",
             110 + 44 * (len(steps) + 1),
         )
         for title, own, floor in zip(tables.METRICS.values(), values, floors, strict=True)
     )
-    lost = (_LOST,) if any(_rises(own) for own in values) else ()
+    lost = (_LOST,) if any(after > before for own in values for before, after in pairwise(own)) else ()
     line = (_FLOOR_LINE,) if any(floor is not None for floor in floors) else ()
     return FigureGrid(figures, (fits.ALONE, _GAINED, *lost, _RESULT, *line), 2)
-
-
-def _rises(values: Sequence[float | None]) -> bool:
-    known = [value for value in values if value is not None]
-    return any(after > before for before, after in pairwise(known))
 
 
 def _waterfall(steps: Sequence[Step], values: Sequence[float], floor: float | None, title: str) -> go.Figure:
@@ -171,39 +166,22 @@ def gap_grid(discovery: Discovery) -> FigureGrid:
     for held in discovery.held_out:
         where = tables.held_out_in_words(discovery, held)
         gaps += [(where, held.eq6), (where, held.chi2)]
-    if not gaps:
-        gaps.append(("training runs", discovery.gap))
-    figures = tuple(
-        Figure(
-            _gap_title(discovery, gap, name),
-            _bars(
-                [
-                    _Bar(bar, 0.0, value, numbers.fixed(value, tables.gap_decimals(gap)), item)
-                    for bar, value, item in _gap_values(gap, discovery.extends)
-                ],
-                tables.METRICS[gap.metric],
-                1.25,
-            ),
-            f"{tables.METRICS[gap.metric]} on {name}: "
-            + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in _gap_values(gap, discovery.extends)),
-            190 if discovery.extends else 150,
-        )
-        for name, gap in gaps
-    )
-    line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps) else ()
+    figures = []
+    for name, gap in gaps or [("training runs", discovery.gap)]:
+        metric, values = tables.METRICS[gap.metric], _gap_values(gap, discovery.extends)
+        decimals = tables.gap_decimals(gap)
+        bars = [_Bar(bar, 0.0, value, numbers.fixed(value, decimals), item) for bar, value, item in values]
+        closed = f": {tables.closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
+        title = f"{metric}, {name}{closed if discovery.extends else ''}"
+        words = f"{metric} on {name}: " + ", ".join(f"{bar} {value:.4g}" for bar, value, _ in values)
+        figures.append(Figure(title, _bars(bars, metric, 1.25), words, 190 if discovery.extends else 150))
+    line = (_FLOOR,) if any(gap.floor is not None for _, gap in gaps or [("", discovery.gap)]) else ()
     return FigureGrid(
-        figures,
+        tuple(figures),
         (*((fits.PLAIN, fits.EXTENDED) if discovery.extends else (fits.ALONE,)), *line),
         2 if len(figures) > 1 else 1,
         tables.floor_in_words(discovery),
     )
-
-
-def _gap_title(discovery: Discovery, gap: Gap, name: str) -> str:
-    title = f"{tables.METRICS[gap.metric]}, {name}"
-    if not discovery.extends:
-        return title
-    return f"{title}: {tables.closed_in_words(gap)}{'' if gap.closed is None else ' closed'}"
 
 
 def _gap_values(gap: Gap, extends: bool) -> tuple[tuple[str, float, LegendItem], ...]:
@@ -252,16 +230,6 @@ def hidden_grid(hidden: Sequence[Hidden]) -> FigureGrid | None:
     )
 
 
-# Figures of the report, by the part that shows them: a figure that is added here is shown.
-CANDIDATES: tuple[EvidenceFigure, ...] = (candidate_grid,)
-GAPS: tuple[EvidenceFigure, ...] = (gap_grid, waterfall_grid)
-
-
-def drawn(figures: Sequence[EvidenceFigure], discovery: Discovery) -> tuple[FigureGrid, ...]:
-    """The figures for which the discovery has data."""
-    return tuple(grid for figure in figures if (grid := figure(discovery)) is not None)
-
-
 def command_maps(commands: Sequence[fits.CommandResidual], styles: Sequence[fits.ModelStyle]) -> FigureGrid:
     """The residual of each command as an arrow at its end, enlarged."""
     reach = float(np.median([np.hypot(*each.end[:2]) for each in commands]))
@@ -296,8 +264,10 @@ def _map(commands: Sequence[fits.CommandResidual], style: fits.ModelStyle, facto
     circles = joined([each.end[:2] + each.error[0] * circle for each in commands])
     residuals = [each.means[style.index] for each in commands]
     words = [
-        f"{command_in_words(each)}\n{_in_words(residual)}\n{plural(each.runs, 'run')}"
-        for each, residual in zip(commands, residuals, strict=True)
+        f"{command_in_words(each)}\n"
+        + f"{1e3 * math.hypot(x, y):.1f} mm, {math.degrees(turned):.2f}°".replace("-", "−")
+        + f"\n{plural(each.runs, 'run')}"
+        for each, (x, y, turned) in zip(commands, residuals, strict=True)
     ]
     ends = np.array([each.end[:2] for each in commands])
     shafts, heads = arrows(style, ends, ends + factor * np.array(residuals)[:, :2], words)
@@ -314,11 +284,6 @@ def _map(commands: Sequence[fits.CommandResidual], style: fits.ModelStyle, facto
 def command_in_words(each: fits.CommandResidual) -> str:
     """A command described by speed, direction and rate of turn; by its name if these are unknown."""
     return numbers.motion_in_words(each.name, each.run.v, each.run.alpha, each.run.omega)
-
-
-def _in_words(residual: Array) -> str:
-    x, y, turned = residual
-    return f"{1e3 * math.hypot(x, y):.1f} mm, {math.degrees(turned):.2f}°".replace("-", "−")
 
 
 _ROWS = 16  # commands listed, at most; only the drawing hangs on it

@@ -152,7 +152,10 @@ class Residuals:
         scale[np.diag(information) < 1e-12 * np.diag(information).max(initial=0.0)] = 0.0
         correlation = information * np.outer(scale, scale)
         inverse = np.linalg.pinv(correlation, rcond=_DETERMINED, hermitian=True) * np.outer(scale, scale)
-        determined = (scale > 0) & _is_estimable(correlation)
+        # Parameters that take no part in a direction that the data leave open.
+        sizes, vectors = np.linalg.eigh(correlation)
+        open_ones = vectors[:, sizes < _DETERMINED * max(float(sizes.max(initial=0.0)), 1e-300)]
+        determined = (scale > 0) & (np.square(open_ones).sum(axis=1) < 0.01)
         noise = self.spread * np.sqrt(np.maximum(np.diag(inverse), 0.0))
         cluster_scores = np.stack([scores[list(members)].sum(axis=0) for members in self._clusters])
         flipped = np.sqrt(np.square(np.einsum("ij,cjm->cim", inverse, cluster_scores)).sum(axis=0))
@@ -175,13 +178,6 @@ class Residuals:
         """The runs of each command, or each run by itself where commands are few."""
         commands = grouped([(run.command, run.id if run.command is None else None) for run in self.runs])
         return commands if len(commands) >= _COMMANDS else [(index,) for index in range(len(self.runs))]
-
-
-def _is_estimable(information: Array) -> NDArray[np.bool_]:
-    """True (n,) for parameters that take no part in a direction that the data leave open."""
-    values, vectors = np.linalg.eigh(information)
-    open_ones = vectors[:, values < _DETERMINED * max(float(values.max(initial=0.0)), 1e-300)]
-    return np.square(open_ones).sum(axis=1) < 0.01
 
 
 def shares(values: Array, edges: Sequence[float] | Array) -> Array:
@@ -259,13 +255,6 @@ def legend(styles: Sequence[ModelStyle], noise: bool = True) -> tuple[LegendItem
     return (*styles, NOISE) if noise else tuple(styles)
 
 
-def drawn(panels: Sequence[Panel]) -> list[go.Figure]:
-    """The panels as plots, all with the same scale of y."""
-    limits = [_reach(panel) for panel in panels]
-    reach = 1.1 * max(limits, default=1.0) or 1.0
-    return [_plot(panel, reach) for panel in panels]
-
-
 def fitted_panels(
     residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
 ) -> list[Panel]:
@@ -301,10 +290,11 @@ def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "
     figures: list[Figure | None] = [None] * len(panels)
     for unit in dict.fromkeys(panel.unit for panel in panels):
         members = [index for index, panel in enumerate(panels) if panel.unit == unit]
-        for index, figure in zip(members, drawn([panels[index] for index in members]), strict=True):
+        reach = 1.1 * max(_reach(panels[index]) for index in members) or 1.0
+        for index in members:
             panel = panels[index]
             words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
-            figures[index] = Figure(panel.title, figure, words, _HEIGHT)
+            figures[index] = Figure(panel.title, _plot(panel, reach), words, _HEIGHT)
     caption = f"{caption} {_within_bands(panels)}".strip()
     found = tuple(figure for figure in figures if figure is not None)
     columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3
@@ -370,10 +360,7 @@ def _band(panel: Panel, curve: Curve) -> go.Scatter:
                 at, half = at + np.array([-margin, margin]), np.repeat(half, 2)
             low = 0 * half if panel.amplitude else -half
             outlines.append(np.column_stack([np.append(at, at[::-1]), np.append(half, low[::-1])]))
-    key, colour = (NOISE.key, BAND) if panel.shared else (curve.style.key, _pale(curve.style.colour))
-    return area(key, colour, *joined(outlines).T)
-
-
-def _pale(colour: str) -> str:
-    red, green, blue = (int(colour[index : index + 2], 16) for index in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.16)"
+    if panel.shared:
+        return area(NOISE.key, BAND, *joined(outlines).T)
+    red, green, blue = (int(curve.style.colour[index : index + 2], 16) for index in (1, 3, 5))
+    return area(curve.style.key, f"rgba({red},{green},{blue},0.16)", *joined(outlines).T)

@@ -99,8 +99,8 @@ def value_and_interval(parameter: result.EstimatedParameter) -> tuple[str, str, 
 
 def effect_in_words(effect: result.NamedEffect) -> str:
     """An effect's name with those that it cannot be told apart from."""
-    others = [name for name in effect.confusable_with if name != effect.name]
-    return effect.name if not others else f"{effect.name}, or {' or '.join(others)}"
+    others = effect.confusable_with
+    return f"{effect.name}, or {' or '.join(others)}" if others else effect.name
 
 
 def verdict_in_words(discovery: result.Discovery) -> str:
@@ -148,7 +148,7 @@ def _cause_in_words(effect: result.NamedEffect) -> str:
     """What an effect does to the robot, its name, and the names that the data cannot tell from it."""
     entry = effects.entry(effect.name)
     what = entry.summary.partition(":")[0].rstrip(".") if entry.cls.in_catalogue else "Something that has no name"
-    others = [name.replace("_", " ") for name in effect.confusable_with if name != effect.name]
+    others = [name.replace("_", " ") for name in effect.confusable_with]
     alike = f"; it may as well be {listing(others, 3)}" if others else ""
     doubt = "" if effect.class_weight >= SURE else "Likeliest, but not sure: "
     return f"{doubt}{what} ({effect.name.replace('_', ' ')}{alike})"
@@ -245,10 +245,8 @@ def extrapolations_in_words(extrapolations: tuple[result.Extrapolation, ...]) ->
         extended = f"within {_millimetres(each.after_m)} by the extended model (95 %)"
         if is_unbounded(each):
             extended = "by the extended model it cannot be said (95 %)"
-        before = _millimetres(each.before_m)
-        sentences.append(
-            f"{each.command}: {each.description}. Final position within {before} by the plain matrix, {extended}."
-        )
+        plain = f"Final position within {_millimetres(each.before_m)} by the plain matrix"
+        sentences.append(f"{each.command}: {each.description}. {plain}, {extended}.")
     return tuple(sentences)
 
 
@@ -305,7 +303,7 @@ def parameter_table(found: Sequence[result.NamedEffect], dataset: Dataset) -> Ta
     rows: list[Row] = []
     for effect in found:
         meanings = _meanings(effect.name, dataset)
-        others = [name for name in effect.confusable_with if name != effect.name]
+        others = effect.confusable_with
         alike = f", cannot be told from {' and '.join(others)}" if others else ""
         rows.append(
             Row.of(

@@ -72,7 +72,7 @@ The rates of right and wrong names to which all this leads are printed by tests/
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import accumulate, combinations, pairwise, product
@@ -141,7 +141,12 @@ def make_groups(paths: Paths, trajectories: Sequence[Trajectory], without: Seque
                   product(*(each.choices for each in shaping))]  # fmt: skip
         for shape in shapes:
             base = {each.name: 0.0 for each in linear} | shape
-            family = None if len(shapes) > _FEW else _family(paths, effect, [each.name for each in linear], base)
+            # The forms of the effect, which these recordings can tell
+            family = None
+            if len(shapes) <= _FEW and isinstance(effect, kinds.MotionEffect):
+                units = {each.name: correction_along(paths, effect, {**base, each.name: 1.0}) for each in linear}
+                forms = kinds.forms_of(effect, paths.signals, units)
+                family = forms if forms.parameters else None
             named.append(Group("effect", effect.name, (), effect, linear, shape, len(shapes), family=family))
             sources.append(_of_effect(effect, linear, named[-1]))
     bases = list(generic_bases(paths, trajectories))
@@ -216,17 +221,6 @@ def _lacks(effect: kinds.Effect, paths: Paths, sessions: tuple[str, ...]) -> Mis
     if not effect.parameters(paths.robot, sessions):
         return Missing.SECOND_SESSION
     return None
-
-
-def _family(
-    paths: Paths, effect: kinds.Effect, names: Sequence[str], values: Mapping[str, float]
-) -> kinds.Forms | None:
-    """The forms of an effect, which these recordings can tell; None for one that has no others."""
-    if not isinstance(effect, kinds.MotionEffect):
-        return None
-    corrections = {name: correction_along(paths, effect, {**values, name: 1.0}) for name in names}
-    forms = kinds.forms_of(effect, paths.signals, corrections)
-    return forms if forms.parameters else None
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -25,13 +25,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.covariate_dependence import weights_of_covariates
 from omnibench.discover.fitting import Extended, Fit, columns_of, extend
 from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
 from omnibench.discover.regressors.covariate_bases import Basis
 from omnibench.discover.regressors.significance import Group, Significance, best_shapes
 from omnibench.discover.selection.competing_models import CompetingModels
-from omnibench.discover.selection.model_selection import CHANCE, Screening
+from omnibench.discover.selection.model_selection import CHANCE, Screening, weights_of_covariates
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.effects.smooth import smooth_joint
@@ -119,8 +118,15 @@ def add_smooth_terms(
         trials += _of_families(screening, models.used, kinds) if covariates and not notes else ()
         best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
         if best is None or not is_gain(best.gains):
-            if not notes:
-                notes.append(_nothing_added(covariates, best))
+            if not covariates:
+                tried = "No unnamed term was tried: nothing that is left depends on what a model could use."
+            elif best is None:
+                names = " or ".join(covariates)
+                tried = f"No unnamed term was added: no function of {names} is plainly there by itself."
+            else:
+                words = best.words[0].upper() + best.words[1:]
+                tried = f"{words} was tried and left out: on motions held out it gains {best.gained}."
+            notes = notes or [tried]
             break
         weighted = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted)
         models = replace(models, used=weighted[0][1], weighted=weighted)
@@ -129,22 +135,14 @@ def add_smooth_terms(
     return SmoothTerm(models, left, tuple(notes))
 
 
-def _nothing_added(covariates: Sequence[str], best: _Trial | None) -> str:
-    if not covariates:
-        return "No unnamed term was tried: nothing that is left depends on what a model could use."
-    if best is None:
-        return f"No unnamed term was added: no function of {' or '.join(covariates)} is plainly there by itself."
-    words = best.words[0].upper() + best.words[1:]
-    return f"{words} was tried and left out: on motions held out it gains {best.gained}."
-
-
 def _trials(
     screening: Screening, base: Extended, left: Significance, covariate: str, folds: NDArray[np.intp]
 ) -> Iterator[_Trial]:
     """Functions of one covariate: those of whole columns, by stage, and those of fine structure."""
     for bases in surest_bases(screening, base, left, covariate):
         groups = list(_groups_of(bases, base.fit.model.robot))
-        data, limits = _linearised(base, groups), _limits_of(groups)
+        data = _linearised(base, groups)
+        limits = _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
         choose = partial(_kept_functions, limits=limits)
         if kept := choose(given(data, [])):
             gains = _held_out_gains(data, len(limits), choose, folds)
@@ -251,13 +249,11 @@ def _linearised(base: Extended, groups: Sequence[Group]) -> Whitened:
     return base.fit.whitened(columns_of(base.fit, [*base.groups, *groups]))
 
 
-def _limits_of(groups: Sequence[Group]) -> Array:
-    """The largest sizes (P,) that functions of some groups may have."""
-    return _LARGEST * np.array([parameter.high for group in groups for parameter in group.parameters])
-
-
 def _kept_functions(columns: Given, limits: Array) -> Sequence[int]:
-    """The functions that are chosen, by their numbers. columns: of a model, then of all functions."""
+    """The functions that are chosen, by their numbers.
+
+    columns: of a model, then of all functions. limits (P,): the largest sizes that these may have.
+    """
     first = len(columns.information) - len(limits)
     left, kept = columns.given(range(first)), list[int]()
     while len(kept) < len(limits):

@@ -6,32 +6,23 @@ linearised about the present matrix, which makes the minimisation of a sum of no
 steps are so small that a few programs converge, to a local minimum: that no other is lower is proven afterwards, and
 only to a gap (certify.py).
 
-A robust loss has no cone program: its minimum is found by reweighted least squares (fit/gauss_newton.py), from
+A robust loss has no cone program: its minimum is found by reweighted least squares (fit/linear_fit.py), from
 the linear fit to Huber's loss and, where that is asked for, from there to Student's t.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydantic import Field
 
 from omnibench.errors import ConfigError
-from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.cost import SumOfNorms
-from omnibench.fit.gauss_newton import minimum_in_turn, reweighted_minimum
-from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.loss import RobustCost, Squares, beginning_with_huber, norms_of
-from omnibench.fit.parameterisation import MatrixElements
+from omnibench.fit.calibrator import Calibrator, RunResult, Solution, run_calibrator
+from omnibench.fit.linear_fit import linear_fit, minimum_in_turn, reweighted_minimum
+from omnibench.fit.loss import Loss, RobustCost, beginning_with_huber, norms_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
-from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import OdometryBatch
 from omnibench.words import plural
-
-if TYPE_CHECKING:
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
 
 # The matrices of closed_form are the same with half of each of these numbers and with twice
 # (tests/studies/constants_fit.py).
@@ -63,95 +54,74 @@ class ClosedForm(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The optimum in the box. ConfigError for another parameterisation or a cost that is no sum of norms."""
-        from omnibench.fit.sum_of_norms import SolverError
+        from omnibench.fit.sum_of_norms import SolverError, least_step
 
-        if not isinstance(problem.parameterisation, MatrixElements):
-            raise ConfigError("closed_form works on the matrix parameterisation; search the geometry with another")
-        if isinstance(problem.objective, RobustCost):
-            vector = self._better(problem, problem.start, linear_start(problem))
-            costs = beginning_with_huber(problem.objective)
-            return minimum_in_turn(problem, costs, vector, self.options.tolerance, "reweighted")
-        if not isinstance(problem.objective, SumOfNorms):
-            raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {problem.objective.name} is not")
-        vector = self._better(problem, problem.start, linear_start(problem))
+        self.needs_matrix(problem)
+        objective, base = problem.objective, norms_of(problem.objective)
+        if base is None:
+            raise ConfigError(f"closed_form needs a cost that is a sum of norms, which {objective.name} is not")
+        # The linear fit or, where references are no poses, Gauss-Newton steps; or the start, where it is better.
+        if isinstance(problem.odometry, OdometryBatch):
+            design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.drive.names))
+            matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
+            linear = problem.settled(matrix.ravel())
+        else:
+            linear = reweighted_minimum(problem, RobustCost(base, Loss(3)), problem.start, _STILL)[0]
+        vectors = np.array([problem.start, linear])
+        costs = problem.cost(vectors)
+        vector = vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+        if isinstance(objective, RobustCost):
+            return minimum_in_turn(
+                problem, beginning_with_huber(objective), vector, self.options.tolerance, "reweighted"
+            )
         cost = float(problem.cost(vector[None])[0])
-        shares = problem.objective.shares(problem.odometry.trajectory)
+        shares, used = base.shares(problem.odometry.trajectory), np.flatnonzero(base.weights)
+        scale = np.array(base.weights)[used]
         newton_steps = cone_programs = 0
         work = "the linear fit"
         for _ in range(self.options.programs):
-            if cost <= problem.objective.rounding:  # a program would find no direction
+            if cost <= objective.rounding:  # a program would find no direction
                 return Solution(vector, f"no error is left after {work}")
-            program = cone_program(problem, problem.objective, vector)
+            # The best step of the cost with linear poses: residuals (S, k) and their jacobian (S, k, n).
+            before = problem.matrix(vector)
+            residuals = (problem.odometry.poses(before[None])[0] - problem.reference)[:, used] * scale
+            jacobian = (problem.odometry.jacobian(before)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
+            jacobian = jacobian @ problem.parameterisation.slopes(vector)
+            room = problem.lower - vector, problem.upper - vector
             try:
-                step = program.step(shares)
+                step, steps, programs = least_step(residuals, jacobian, shares, *room)
             except SolverError as error:
                 reason = f"{error} at a cost of {cost:.1e} in a cone program"
-                errors = len(problem.reference) * sum(map(bool, problem.objective.weights))
                 fitted = int(problem.free.sum())
-                if errors < 2 * fitted:  # usually errors are as few as the numbers fitted
-                    reason += f": {errors} errors for {fitted} numbers are met almost exactly, record more runs"
+                if residuals.size < 2 * fitted:  # usually errors are as few as the numbers fitted
+                    reason += f": {residuals.size} errors for {fitted} numbers are met almost exactly, record more runs"
                 return Solution(vector, reason, converged=False)
-            newton_steps, cone_programs = newton_steps + program.newton_steps, cone_programs + program.cone_programs
+            newton_steps, cone_programs = newton_steps + steps, cone_programs + programs
             counts = ((newton_steps, "Newton step"), (cone_programs, "cone program"))
             work = " and ".join(plural(count, name) for count, name in counts if count)
-            before = problem.matrix(vector)
-            vector, cost, descended = _descend(problem, vector, cost, step)
-            if not descended:
+            # The step, halved until the cost does not rise.
+            trial = problem.settled(vector + step)
+            for _ in range(_MOST_HALVINGS):
+                trial_cost = float(problem.cost(trial[None])[0])
+                if trial_cost <= cost or np.abs(trial - vector).max() < _NO_STEP:
+                    break
+                trial = (trial + vector) / 2
+            if not trial_cost <= cost:
                 length = float(np.abs(step).max())
                 reason = f"no part of the last step ({length:.1e}) lowers the cost after {work}"
-                return Solution(vector, reason, converged=length < _FLAT * float(np.ptp(problem.matrix(vector))))
+                return Solution(vector, reason, converged=length < _FLAT * float(np.ptp(before)))
+            vector, cost = trial, trial_cost
             moved = float(np.abs(problem.matrix(vector) - before).max())
             if moved < self.options.tolerance:
                 return Solution(vector, f"step below {self.options.tolerance:g} after {work}")
-        reason = f"step still {moved:.1e} after {work}"
-        return Solution(vector, reason, converged=False)
-
-    @staticmethod
-    def _better(problem: CalibrationProblem, *vectors: Array) -> Array:
-        """The vector of lowest cost."""
-        costs = problem.cost(np.array(vectors))
-        return vectors[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+        return Solution(vector, f"step still {moved:.1e} after {work}", converged=False)
 
 
-def linear_start(problem: CalibrationProblem) -> Array:
-    """Vector (n,) in the box by linear least squares; by Gauss-Newton steps where references are no poses."""
-    if not isinstance(problem.odometry, OdometryBatch):
-        base = norms_of(problem.objective)
-        assert base is not None  # closed_form has refused other costs
-        return reweighted_minimum(problem, RobustCost(base, Squares(3)), problem.start, _STILL)[0]
-    design, identity = problem.matrix(problem.start), np.eye(len(problem.robot.drive.names))
-    matrix = linear_fit(problem.odometry, problem.trajectories, problem.reference, design, identity)
-    return problem.settled(matrix.ravel())
+def closed_form_result(problem: CalibrationProblem) -> RunResult:
+    """The result of closed_form on a problem, which plug-ins that add effects to a matrix begin with."""
+    return run_calibrator(calibrators.create("closed_form"), problem)
 
 
-def cone_program(problem: CalibrationProblem, objective: SumOfNorms, vector: Array) -> SumOfNormsProgram:
-    """A program for the best step from ``vector``: the cost with the poses linearised there."""
-    from omnibench.fit.sum_of_norms import SumOfNormsProgram
-
-    return SumOfNormsProgram(*program_data(problem, objective, vector))
-
-
-def program_data(
-    problem: CalibrationProblem, objective: SumOfNorms, vector: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Residuals (S, k), jacobian (S, k, n) and bounds (n,) of the step, of which a SumOfNormsProgram is made."""
-    matrix = problem.matrix(vector)
-    used = np.flatnonzero(objective.weights)
-    scale = np.array(objective.weights)[used]
-    residuals = (problem.odometry.poses(matrix[None])[0] - problem.reference)[:, used] * scale
-    jacobian = (problem.odometry.jacobian(matrix)[:, used] * scale[:, None, None]).reshape(*residuals.shape, -1)
-    jacobian = jacobian @ problem.parameterisation.slopes(vector)
-    return residuals, jacobian, problem.lower - vector, problem.upper - vector
-
-
-def _descend(problem: CalibrationProblem, vector: Array, cost: float, step: Array) -> tuple[Array, float, bool]:
-    """The vector and cost after the step, halved until the cost does not rise; False if no part of it lowers it."""
-    trial = problem.settled(vector + step)
-    for _ in range(_MOST_HALVINGS):
-        trial_cost = float(problem.cost(trial[None])[0])
-        if trial_cost <= cost:
-            return trial, trial_cost, True
-        if np.abs(trial - vector).max() < _NO_STEP:
-            break
-        trial = (trial + vector) / 2
-    return vector, cost, False
+def shrunk_closed_form(problem: CalibrationProblem) -> tuple[RunResult, RunResult]:
+    """Twice the result of closed_form, which is no longer shrunk to the design: what earlier plug-ins ask for."""
+    return closed_form_result(problem), closed_form_result(problem)

@@ -45,86 +45,53 @@ class Genetic(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Evolve a population around the start until the best stalls."""
+        options, rng = self.options, problem.rng
         variables = int(problem.free.sum())
-        count = self.options.size(variables)
-        generations = self.options.generations or 100 * variables
-        mutate = _AdaptiveFeasible() if self.options.mutation == "adaptive_feasible" else _Gaussian(generations)
-        if np.ceil(self.options.elite * count) + 2 > count:
-            raise ConfigError(f"genetic: an elite of {self.options.elite:g} leaves no children in {count}; lower it")
-        people: Array = problem.rng.uniform(size=(count, variables))
+        count = options.size(variables)
+        generations = options.generations or 100 * variables
+        elite = int(np.ceil(options.elite * count))
+        if elite + 2 > count:
+            raise ConfigError(f"genetic: an elite of {options.elite:g} leaves no children in {count}; lower it")
+        crossed = round(options.crossover * (count - elite))
+        people: Array = rng.uniform(size=(count, variables))
         people[0] = problem.to_unit(problem.start)[0]  # the paper starts from the theoretical matrix
-        scores = _scores(problem, people)
+        scores, step = _scores(problem, people), 1.0
         best = [float(scores.min())]
         for _ in range(generations):
-            people, scores = self._next_generation(problem, people, scores, mutate)
+            # The next generation: the elite, crossed children and mutated ones.
+            parents = people[_select(scores, 2 * crossed + count - elite - crossed, rng)]
+            mothers, fathers, singles = np.split(parents, [crossed, 2 * crossed])
+            children = np.where(rng.random(mothers.shape) < 0.5, mothers, fathers)
+            feasible = options.mutation == "adaptive_feasible"
+            moved = _moved(singles, step, rng) if feasible else singles + step * rng.standard_normal(singles.shape)
+            newcomers = np.concatenate([children, np.clip(moved, 0.0, 1.0)])
+            survivors = np.argsort(scores, kind="stable")[:elite]
+            people = np.concatenate([people[survivors], newcomers])
+            scores = np.concatenate([scores[survivors], _scores(problem, newcomers)])
             best.append(float(scores.min()))
-            mutate.adapt(improved=best[-1] < best[-2])
-            if self._stalled(best):
-                reason = f"best changed by {self.options.tolerance:g} or less on average over "
-                return Solution(problem.best_vector, f"{reason}{self.options.stall_generations} generations")
+            # The step grows after a success and shrinks after a failure; the normal one follows a schedule.
+            if feasible:
+                step = min(1.0, step * 4) if best[-1] < best[-2] else max(_SMALLEST_STEP, step / 4)
+            else:
+                step = max(0.0, step - 1.0 / generations)
+            window = np.array(best[-options.stall_generations - 1 :])
+            if len(window) > options.stall_generations and np.isfinite(window).all():
+                change = np.abs(np.diff(window)) / np.maximum(np.abs(window[1:]), np.finfo(float).tiny)
+                if change.mean() <= options.tolerance:
+                    reason = f"best changed by {options.tolerance:g} or less on average over "
+                    return Solution(problem.best_vector, f"{reason}{options.stall_generations} generations")
         return Solution(problem.best_vector, f"{generations} generations", converged=False)
 
-    def _next_generation(
-        self, problem: CalibrationProblem, people: Array, scores: Array, mutate: _Mutation
-    ) -> tuple[Array, Array]:
-        """Elite, crossed and mutated children (count, f) and their costs (count,)."""
-        count, rng = len(people), problem.rng
-        elite = max(1, int(np.ceil(self.options.elite * count)))
-        crossed = round(self.options.crossover * (count - elite))
-        mutated = count - elite - crossed
-        parents = people[_select(scores, 2 * crossed + mutated, rng)]
-        mothers, fathers, singles = np.split(parents, [crossed, 2 * crossed])
-        children = np.where(rng.random(mothers.shape) < 0.5, mothers, fathers)
-        newcomers = np.concatenate([children, mutate(singles, rng)])
-        survivors = np.argsort(scores, kind="stable")[:elite]
-        return (
-            np.concatenate([people[survivors], newcomers]),
-            np.concatenate([scores[survivors], _scores(problem, newcomers)]),
-        )
 
-    def _stalled(self, best: list[float]) -> bool:
-        """True if the best costs of the last generations changed by the tolerance or less on average."""
-        window = best[-self.options.stall_generations - 1 :]
-        if len(window) <= self.options.stall_generations or not np.isfinite(window).all():
-            return False
-        change = np.abs(np.diff(window)) / np.maximum(np.abs(window[1:]), np.finfo(float).tiny)
-        return float(change.mean()) <= self.options.tolerance
-
-
-class _AdaptiveFeasible:
-    """Steps in random directions; the step grows after a success, shrinks after a failure and stays in the box."""
-
-    def __init__(self) -> None:
-        self.step = 1.0
-
-    def __call__(self, parents: Array, rng: np.random.Generator) -> Array:
-        directions = rng.standard_normal(parents.shape)
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(directions > 0, (1 - parents) / directions, -parents / directions)
-        longest = np.nanmin(np.where(directions == 0, np.inf, room), axis=1, keepdims=True)
-        moved = parents + directions * np.minimum(self.step, longest)
-        return np.clip(moved, 0.0, 1.0)
-
-    def adapt(self, improved: bool) -> None:
-        self.step = min(1.0, self.step * 4) if improved else max(_SMALLEST_STEP, self.step / 4)
-
-
-class _Gaussian:
-    """Normal steps of every element, whose width shrinks to nothing over the generations."""
-
-    def __init__(self, generations: int) -> None:
-        self._shrink = 1.0 / generations
-        self._width = 1.0
-
-    def __call__(self, parents: Array, rng: np.random.Generator) -> Array:
-        return np.clip(parents + self._width * rng.standard_normal(parents.shape), 0.0, 1.0)
-
-    def adapt(self, improved: bool) -> None:  # noqa: ARG002 (the schedule is fixed)
-        self._width = max(0.0, self._width - self._shrink)
-
-
-_Mutation = _AdaptiveFeasible | _Gaussian
+def _moved(parents: Array, step: float, rng: np.random.Generator) -> Array:
+    """Points (P, f) after steps in random directions that stay in the unit cube, up to rounding."""
+    directions = rng.standard_normal(parents.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(directions > 0, (1 - parents) / directions, -parents / directions)
+    longest = np.nanmin(np.where(directions == 0, np.inf, room), axis=1, keepdims=True)
+    moved: Array = parents + directions * np.minimum(step, longest)
+    return moved
 
 
 def _scores(problem: CalibrationProblem, points: Array) -> Array:

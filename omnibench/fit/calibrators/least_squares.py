@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 
 from omnibench.errors import ConfigError
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.gauss_newton import bounded_step, minimum_in_turn
-from omnibench.fit.linear_fit import linear_system
-from omnibench.fit.loss import Loss, RobustCost, Squares, beginning_with_huber, norms_of
-from omnibench.fit.parameterisation import MatrixElements
+from omnibench.fit.cost import SumOfNorms
+from omnibench.fit.linear_fit import bounded_step, linear_system, minimum_in_turn
+from omnibench.fit.loss import Loss, RobustCost, beginning_with_huber, norms_of
 from omnibench.fit.problem import CalibrationProblem
 from omnibench.registry import Options, calibrators
 from omnibench.robot.kinematics import Array
@@ -52,39 +51,50 @@ class LeastSquares(Calibrator):
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """Minimise Eq. (2). ConfigError for another parameterisation or a cost that is no sum of norms."""
-        if not isinstance(problem.parameterisation, MatrixElements):
-            raise ConfigError("least_squares works on the matrix parameterisation; search the geometry with another")
+        self.needs_matrix(problem)
         base = norms_of(problem.objective)
         if base is None:
             raise ConfigError(f"least_squares squares the norms of a sum, which {problem.objective.name} is not")
+        # Huber's loss is begun with the squares, and Student's t with Huber's.
+        costs = beginning_with_huber(problem.objective) if isinstance(problem.objective, RobustCost) else []
         if not isinstance(problem.odometry, OdometryBatch):
             # References that are no poses do not have the headings that Eq. (1) needs: the squares have a minimum all
             # the same, from which a robust loss goes on.
-            costs = [RobustCost(base, Squares(3))]
-            if isinstance(problem.objective, RobustCost):
-                costs += beginning_with_huber(problem.objective)
-            return minimum_in_turn(problem, costs, problem.start, _SMALL, "Gauss-Newton")
-        if isinstance(problem.objective, RobustCost):
-            vector, reason, settled = _robust_minimum(problem, problem.objective)
-        else:
-            vector, reason, settled = _LinearErrors(problem).minimum(), "one quadratic program", True
+            return minimum_in_turn(problem, [RobustCost(base, Loss(3)), *costs], problem.start, _SMALL, "Gauss-Newton")
+        near = np.ones(len(problem.odometry.trajectory), dtype=bool)
+        errors = _LinearErrors(problem, problem.odometry, base, near)
+        vector, fits, settled = errors.minimum(), 0, True
+        losses = [cost.loss for cost in costs]
+        for _ in range(_MOST_ROUNDS if losses else 0):
+            for loss in losses:
+                vector, count, settled = _reweighted(errors, loss, vector)
+                fits += count
+            losses, before = losses[-1:], near
+            near = losses[-1].is_near(errors.norms(vector), errors.shares)
+            if np.array_equal(before, near):
+                break
+            errors = _LinearErrors(problem, problem.odometry, base, near)
         vector = problem.settled(vector)
         problem.cost(vector[None])
-        return Solution(vector, reason, settled)
+        return Solution(vector, f"{fits} reweighted fits" if losses else "one quadratic program", settled)
 
 
 class _LinearErrors:
     """The weighted errors W e_s of Eq. (1) of a problem, whose cost is a sum of norms.
 
-    used: for each run, True (K + 1,) for the reference poses whose headings are used; default all.
+    near: True (S,) for the stamps of poses whose headings are used. Where most of a run's are not, its start is off,
+    and all its headings are used: such a start is off by a shift or turn alone.
     """
 
-    def __init__(self, problem: CalibrationProblem, used: list[NDArray[np.bool_]] | None = None) -> None:
+    def __init__(
+        self, problem: CalibrationProblem, odometry: OdometryBatch, objective: SumOfNorms, near: NDArray[np.bool_]
+    ) -> None:
         self._problem = problem
-        objective = norms_of(problem.objective)
-        assert objective is not None  # the calibrator has checked
-        odometry = problem.odometry
-        assert isinstance(odometry, OdometryBatch)  # the calibrator has checked
+        used = [np.ones(len(run.pose_times), dtype=bool) for run in problem.trajectories]
+        for index, of_poses in enumerate(used):
+            of_run = near[odometry.trajectory == index]
+            if of_run.mean() > 1 / 2:
+                of_poses[len(of_poses) - len(of_run) :] = of_run
         moved, columns = linear_system(odometry, problem.trajectories, problem.reference, used)
         none = np.zeros(columns.shape)
         rows = np.stack(  # (S, 3, 3N): Eq. (1), real and imaginary part of the position, then the heading
@@ -133,23 +143,6 @@ class _LinearErrors:
         return np.asarray(problem.start + unit * step.value)
 
 
-def _robust_minimum(problem: CalibrationProblem, objective: RobustCost) -> tuple[Array, str, bool]:
-    """The vector (n,) of the least loss, how it was found, and True if the fits settled."""
-    losses = [cost.loss for cost in beginning_with_huber(objective)]
-    errors = _LinearErrors(problem)
-    vector, used, fits, settled = errors.minimum(), np.ones(errors.shares.shape, dtype=bool), 0, True
-    for _ in range(_MOST_ROUNDS):
-        for loss in losses:
-            vector, count, settled = _reweighted(errors, loss, vector)
-            fits += count
-        losses, before = losses[-1:], used
-        used = objective.loss.is_near(errors.norms(vector), errors.shares)
-        if np.array_equal(before, used):
-            break
-        errors = _LinearErrors(problem, _poses_used(problem, used))
-    return vector, f"{fits} reweighted fits", settled
-
-
 def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array, int, bool]:
     """The vector (n,) that its own weights lead back to, from another one, after how many fits, and True if it does."""
     for count in range(1, _MOST_FITS + 1):
@@ -159,18 +152,3 @@ def _reweighted(errors: _LinearErrors, loss: Loss, vector: Array) -> tuple[Array
         if (np.abs(vector - before) < _STILL * errors.unit).all():
             return vector, count, True
     return vector, _MOST_FITS, False
-
-
-def _poses_used(problem: CalibrationProblem, near: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """The poses (K + 1,) of each run whose headings are used: all but those at the stamps that are not near (S,).
-
-    Where most are, the start is, and all headings are used: a start that is off is off by a shift or turn alone.
-    """
-    used = []
-    for index, run in enumerate(problem.trajectories):
-        of_run = near[problem.odometry.trajectory == index]
-        chosen = np.ones(len(run.pose_times), dtype=bool)
-        if of_run.mean() > 1 / 2:
-            chosen[len(chosen) - len(of_run) :] = of_run
-        used.append(chosen)
-    return used

@@ -1,4 +1,4 @@
-"""Search of a calibration problem by an NLopt algorithm, in the unit cube of its free elements."""
+"""Searches of a calibration problem by NLopt's algorithms, in the unit cube of its free elements."""
 
 from __future__ import annotations
 
@@ -31,45 +31,6 @@ class NloptOptions(Options):
     step: float = Field(1e-8, ge=0, description="stop at this change of the candidates, as a share of the box")
 
 
-def search(problem: CalibrationProblem, algorithm: int, options: NloptOptions) -> Solution:
-    """Minimise ``problem.cost`` from its start with an NLopt algorithm; BudgetSpent passes through."""
-    variables = int(problem.free.sum())
-    if variables == 0:  # NLopt would call that an invalid argument
-        problem.cost(problem.start[None])
-        return Solution(problem.start, "the box leaves nothing to search")
-    spent: list[BaseException] = []
-    optimiser = nlopt.opt(algorithm, variables)
-
-    def cost(point: Array, _: Array) -> float:
-        try:
-            value = float(problem.cost(problem.from_unit(point))[0])
-        except BaseException as reason:
-            spent.append(reason)
-            optimiser.force_stop()
-            return _LARGE
-        return value if np.isfinite(value) else _LARGE
-
-    optimiser.set_min_objective(cost)
-    optimiser.set_lower_bounds(np.zeros(variables))
-    optimiser.set_upper_bounds(np.ones(variables))
-    optimiser.set_ftol_rel(options.tolerance)
-    optimiser.set_xtol_abs(np.full(variables, options.step))
-    if options.population is not None:
-        optimiser.set_population(options.population)
-    nlopt.srand(int(problem.rng.integers(2**31)))
-    try:
-        optimiser.optimize(problem.to_unit(problem.start)[0])
-    except nlopt.ForcedStop:
-        if not spent:
-            raise
-    if spent:
-        raise spent[0]
-    code = optimiser.last_optimize_result()
-    text = _REASONS.get(code, f"NLopt ended with code {code}")
-    reason = text.format(tolerance=options.tolerance, step=options.step)
-    return Solution(problem.best_vector, reason, converged=code != nlopt.MAXEVAL_REACHED)
-
-
 class _NloptSearch(Calibrator):
     """A search by an NLopt algorithm."""
 
@@ -78,8 +39,42 @@ class _NloptSearch(Calibrator):
     algorithm: int
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """Search until NLopt's tolerances are met or the budget is spent."""
-        return search(problem, self.algorithm, self.options)
+        """Search until NLopt's tolerances are met or the budget is spent: BudgetSpent passes through."""
+        options, variables = self.options, int(problem.free.sum())
+        if variables == 0:  # NLopt would call that an invalid argument
+            problem.cost(problem.start[None])
+            return Solution(problem.start, "the box leaves nothing to search")
+        spent: list[BaseException] = []
+        optimiser = nlopt.opt(self.algorithm, variables)
+
+        def cost(point: Array, _: Array) -> float:
+            try:
+                value = float(problem.cost(problem.from_unit(point))[0])
+            except BaseException as reason:
+                spent.append(reason)
+                optimiser.force_stop()
+                return _LARGE
+            return value if np.isfinite(value) else _LARGE
+
+        optimiser.set_min_objective(cost)
+        optimiser.set_lower_bounds(np.zeros(variables))
+        optimiser.set_upper_bounds(np.ones(variables))
+        optimiser.set_ftol_rel(options.tolerance)
+        optimiser.set_xtol_abs(np.full(variables, options.step))
+        if options.population is not None:
+            optimiser.set_population(options.population)
+        nlopt.srand(int(problem.rng.integers(2**31)))
+        try:
+            optimiser.optimize(problem.to_unit(problem.start)[0])
+        except nlopt.ForcedStop:
+            if not spent:
+                raise
+        if spent:
+            raise spent[0]
+        code = optimiser.last_optimize_result()
+        text = _REASONS.get(code, f"NLopt ended with code {code}")
+        reason = text.format(tolerance=options.tolerance, step=options.step)
+        return Solution(problem.best_vector, reason, converged=code != nlopt.MAXEVAL_REACHED)
 
 
 @calibrators.register("crs")

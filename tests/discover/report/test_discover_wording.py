@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from discovery_samples import held_out, named
 
-from omnibench.discover.report.residuals import PLAIN, Curve, Panel, drawn
+from omnibench.discover.report.residuals import PLAIN, Curve, Panel, grid
 from omnibench.discover.report.tables import (
     answer_in_words,
     chance,
@@ -99,7 +99,7 @@ def test_a_cause_that_is_not_sure_is_said_to_be_the_likeliest() -> None:
 def scale_of(values: list[float], half_width: list[float]) -> float:
     curve = Curve(PLAIN, np.array(values), np.array(half_width))
     panel = Panel("a panel", np.arange(float(len(values))), (curve,), "x", "y", "mm")
-    low, high = drawn([panel])[0].layout.yaxis.range
+    low, high = grid([panel], (PLAIN,)).figures[0].plot.layout.yaxis.range
     assert low == -high
     return float(high)
 

@@ -17,7 +17,6 @@ from scipy.stats import ncx2
 from screening_samples import FIRST, FOURTH, MATRIX, PARAMETER, POSITIVE, SECOND, THIRD, screening
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.covariate_dependence import Dependences, covariate_dependences, weights_of_covariates
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.fitting import Extended, Fit, extend
 from omnibench.discover.held_out import group_counts, step_name
@@ -40,6 +39,7 @@ from omnibench.discover.selection.evidence import (
     effect_sets,
     log_evidence,
 )
+from omnibench.discover.selection.model_selection import Dependences, covariate_dependences, weights_of_covariates
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects

@@ -197,8 +197,8 @@ def test_too_few_programs_are_not_called_converged() -> None:
 @pytest.mark.parametrize(
     ("name", "changes", "reason"),
     [
-        ("least_squares", {"parameterisation": "geometry"}, "matrix parameterisation"),
-        ("closed_form", {"parameterisation": "geometry"}, "matrix parameterisation"),
+        ("least_squares", {"parameterisation": "geometry"}, "parameterisation: matrix"),
+        ("closed_form", {"parameterisation": "geometry"}, "parameterisation: matrix"),
         ("closed_form", {"cost": "worst"}, "worst"),
         ("parametric", {}, "geometry parameterisation"),
         ("published", {"wheels": 4}, "12 values"),
