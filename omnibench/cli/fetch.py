@@ -27,6 +27,7 @@ from omnibench.data.finding import UNITS
 from omnibench.data.storage import check_dataset_folder, save_dataset
 from omnibench.errors import ConfigError, DataError, PluginError, nearest
 from omnibench.files import check_place, refuse_existing, write_files
+from omnibench.processes import interrupts_deferred
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import importers, load_plugin_file
 from omnibench.slam.import_dataset import import_dataset
@@ -204,12 +205,13 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
     command = ["git", *_STALLED, *(() if folder is None else ("-C", str(folder))), *arguments]
     task = f"git {arguments[0]}: {repository}"
     report(Progress(task))
-    silent = subprocess.DEVNULL
-    process = subprocess.Popen(
-        command, env=_environment(), stdin=silent, stdout=silent, stderr=subprocess.PIPE, start_new_session=True
-    )
-    said: list[str] = []
+    silent, said = subprocess.DEVNULL, list[str]()
+    process: subprocess.Popen[bytes] | None = None
     try:
+        with interrupts_deferred():  # a Ctrl-C while git starts would leave it running
+            process = subprocess.Popen(
+                command, env=_environment(), stdin=silent, stdout=silent, stderr=subprocess.PIPE, start_new_session=True
+            )
         for line in _lines(process):
             if (step := _STEP.search(line)) is not None:
                 report(Progress(step[1].lower(), int(step[2]), int(step[3]), "object", note=step[4] or ""))
@@ -217,6 +219,8 @@ def _work(repository: str, arguments: Sequence[str], folder: Path | None, report
                 said.append(line)
         process.wait()
     except BaseException:
+        if process is None:  # there is no git
+            raise
         # Git ends, and the programs that it has started.
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError):
