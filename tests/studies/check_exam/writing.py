@@ -150,13 +150,21 @@ def _write_dataset(damage: Damage, folder: Path) -> None:
 
 
 def read_dataset(folder: Path, sound: Recording) -> Recording:
-    """A data set that omnibench wrote, as a recording of the same robot, with counts by its rates."""
+    """A data set that omnibench wrote, as a recording of the same robot, with counts by its rates.
+
+    Where its wheels have other radii, the counts are those by which the sound robot's wheels roll as far.
+    """
     wheels, poses = (_table(folder, name) for name in ("wheels", "poses"))
+    written = yaml.safe_load((folder / "dataset.yaml").read_text())["robot"]
+    radii, sound_radii = (
+        {wheel["name"]: float(wheel["radius"]) for wheel in robot["wheels"]} for robot in (written, sound.description)
+    )
+    larger = np.array([radii[wheel] / sound_radii[wheel] for wheel in sound.wheels])
     runs = []
     for (name,), rows in wheels.group_by("trajectory", maintain_order=True):
         rates = rows.select([f"omega_{wheel}" for wheel in sound.wheels]).to_numpy()
         times = np.append(0.0, rows["t"].to_numpy())
-        steps = rates * np.diff(times)[:, None] * (sound.ticks / TURN)
+        steps = rates * larger * np.diff(times)[:, None] * (sound.ticks / TURN)
         counts = np.vstack([np.zeros(rates.shape[1]), np.cumsum(steps, axis=0)])
         steering = rows.select([f"steer_{wheel}" for wheel in sound.steered]).to_numpy().reshape(len(rows), -1)
         steering = np.vstack([steering[:1], steering])
