@@ -246,7 +246,7 @@ def _examined(
     if flaw := saved.matrix_flaw(problem.matrix(vector)):
         raise _FlawError(f"the answer's matrix holds {flaw}")
     if solution.extension is None:
-        cost = float(problem.values(vector[None])[0])
+        cost = problem.answer_cost(vector)
     else:
         model = model_of_answer(problem, problem.matrix(vector), solution.extension)
         cost = problem.objective.of_model(model, problem.trajectories)

@@ -234,13 +234,13 @@ def sum_of_norms(
 
 def _check_minimum(problem: CalibrationProblem, vector: Array, free: NDArray[np.bool_], clusters: Clusters) -> None:
     """NoCovarianceError: steps of reweighted least squares lead farther than a standard deviation to a lower cost."""
-    better, cost = vector, float(problem.values(vector[None])[0])
+    better, cost = vector, problem.answer_cost(vector)
     for _ in range(_MOST_STEPS):
         slope, hessian = _of_runs(problem, better, free, bent=False)
         roots = roots_of(hessian.sum(axis=0))
         moved = better.copy()
         moved[free] -= roots @ roots.T @ slope.sum(axis=0)
-        value = float(problem.values(moved[None])[0])
+        value = problem.answer_cost(moved)
         if not value < cost * (1 - _NO_GAIN):
             break
         better, cost = moved, value

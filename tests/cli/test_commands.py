@@ -316,7 +316,8 @@ def test_every_figure_is_written_as_svg_and_png(command: Command, prepared: Prep
     if "scans" in typed:
         save_dataset(sample(repetitions=1, rays=360).dataset, Path("scans"))
     Path("out").mkdir()
-    printed = succeeded(command(*(word.format_map(prepared._asdict()) for word in typed), "--figures", "pictures"))
+    printed = command(*(word.format_map(prepared._asdict()) for word in typed), "--figures", "pictures")
+    assert printed.returncode == (1 if typed[0] == "check" else 0), printed.stderr  # its runs lack motions
     drawn = Path("out/report.html").read_text(encoding="utf-8").count('<div class="figures">')
     assert f"figures: pictures ({drawn}, each as SVG and PNG" in printed.stderr
     pictures = list(Path("pictures").iterdir())
