@@ -269,7 +269,7 @@ class CalibrationProblem:
 
     def answer_cost(self, vector: Array) -> float:
         """Cost of an answer (n,) by direct integration; it is no candidate, and not counted."""
-        return float(self._costs(vector[None], None)[0])
+        return float(self.values(vector[None])[0])
 
     def build_evaluator(self) -> RunsEvaluator | None:
         """Build the fast evaluator, which ``cost`` then uses in the place of direct integration, and return it.

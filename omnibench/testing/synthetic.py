@@ -218,6 +218,14 @@ class ObservedProblem(CalibrationProblem):
             values[self._undefined(self.to_unit(candidates))] = np.nan
         return values
 
+    def answer_cost(self, vector: Array) -> float:
+        """As in every problem: an answer is no candidate."""
+        before = self.uncounted
+        try:
+            return super().answer_cost(vector)
+        finally:
+            self.uncounted = before
+
 
 def synthetic_problem(
     parameterisation: ParameterisationName = "matrix",
