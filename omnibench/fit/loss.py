@@ -250,12 +250,8 @@ class RobustCost(Cost):
     def __init__(self, base: SumOfNorms, loss: Loss) -> None:
         super().__init__(base.options)
         self.base, self.loss = base, loss
-        self.name, self.stamps, self.rounding, self.coordinates = (
-            base.name,
-            base.stamps,
-            base.rounding,
-            base.coordinates,
-        )
+        self.name, self.stamps = base.name, base.stamps
+        self.rounding, self.coordinates = base.rounding, base.coordinates
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,), m: at the scale of each candidate's own errors."""

@@ -128,7 +128,8 @@ class CalibrationProblem:
         self.lower = _read_only(np.where(relevant, bounds.lower, start))
         self.upper = _read_only(np.where(relevant, bounds.upper, start))
         self.free: NDArray[np.bool_] = _read_only(self.upper > self.lower)
-        self.budget, self.evaluations, self.best_vector, self.best_cost = budget, 0, self.start, np.inf
+        self.budget, self.evaluations = budget, 0
+        self.best_vector, self.best_cost = self.start, np.inf
         self.history: list[Improvement] = []
         self._watch, self._shown = watch, 0.0  # s after the begin when ``watch`` was last called
         self._began = time.perf_counter()  # s, of that clock
