@@ -226,7 +226,10 @@ def run_calibrator(calibrator: Calibrator, problem: CalibrationProblem) -> RunRe
 def _examined(
     calibrator: Calibrator, problem: CalibrationProblem, solution: Solution
 ) -> tuple[Array, float, Array | None]:
-    """The answer as a vector (n,), its cost, and its variances' degrees of freedom (n,). _FlawError: it is no answer."""
+    """The answer as a vector (n,), its cost, and its variances' degrees of freedom (n,).
+
+    _FlawError: it is no calibration of the problem.
+    """
     freedom = None
     if solution.degrees_of_freedom is not None:
         freedom = np.broadcast_to(np.asarray(solution.degrees_of_freedom, dtype=float), problem.size)
