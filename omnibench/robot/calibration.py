@@ -65,7 +65,8 @@ _Parameters = Annotated[
 class Slip(config.Model):
     """Scatter of the ends of training runs about the calibrated odometry, which no calibration takes away.
 
-    Standard deviations per root metre that the wheels roll; see fit/path_errors.py.
+    Standard deviations per root metre that the wheels roll: the way, and the turn times their mean distance from the
+    robot's centre.
     """
 
     heading: Deviation = Field(description="of the heading, rad")
