@@ -174,7 +174,8 @@ class Table:
     def _parsed(self, name: str, column: pl.Series) -> Array:
         """Numbers, or texts as such; dates become seconds since 1970."""
         if column.dtype != pl.String:
-            numbers, wrong = column.cast(pl.Float64), pl.Series([False])
+            with readable(self.file):
+                numbers, wrong = column.cast(pl.Float64), pl.Series([False])
         else:
             cells = column.fill_null("").str.strip_chars()
             numbers = cells.cast(pl.Float64, strict=False)
@@ -301,7 +302,7 @@ class _Text:
                     if fields and len(fields) != len(numeric):
                         raise self.ragged(fields, numeric, skipped, row)
         except UnicodeDecodeError:
-            read_text(self.file)  # which says that it is no text
+            read_text(self.file)  # raises DataError: the file is no text in UTF-8
         raise DataError(f"{self.file}: cannot be read: {reason}")
 
     def ragged(self, fields: Sequence[str], names: Sequence[object], skipped: int, row: int) -> DataError:
@@ -332,7 +333,7 @@ def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, l
                     numbers.append(number)
                     first += [fields] if len(first) < _HEADED else []
     except UnicodeDecodeError:
-        read_text(file)  # which says that it is no text
+        read_text(file)  # raises DataError: the file is no text in UTF-8
         raise
     cleaned.flush()
     return cleaned if large else cleaned.getvalue(), first, np.array(numbers)
