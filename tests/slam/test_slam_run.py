@@ -265,6 +265,18 @@ def test_ranges_noisier_than_the_scanner_says_are_noticed() -> None:
     assert np.mean([nees(located(run), run).mean() for run in runs]) < 5
 
 
+def test_the_odometry_is_asked_for_increasing_times() -> None:
+    run = driven("furnished_room", 4)
+
+    def increasing(times: Array) -> Array:
+        assert (np.diff(times) > 0).all()
+        return run.odometry(times)
+
+    for options in (DEFAULT, LAST_POSE):
+        found = run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), increasing)
+        np.testing.assert_array_equal(found.poses, located(run, options).poses)
+
+
 def test_what_cannot_be_located_is_named() -> None:
     run = driven("furnished_room", 4)
     none = TrajectoryScans(np.zeros(0), np.zeros((0, 1080), dtype=np.float32))
