@@ -313,7 +313,7 @@ class _Text:
 
 
 def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, list[str], Lines]:
-    """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
+    """The source that polars reads of a file, its first lines, and the numbers of the lines that are not left out."""
     check_file(file, _MOST_BYTES, text=True)
     try:
         with file.open(encoding="utf-8-sig", newline="") as opened:
