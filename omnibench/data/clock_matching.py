@@ -135,9 +135,9 @@ def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Arr
     for _ in range(ROUNDS):
         before, within = clocks, [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
         changes = [each.columns(clock)[0] for each, clock in zip(windows, clocks, strict=True)]
-        fitted = []  # the coefficients that fit all runs best by their clocks
+        fitted = []  # the coefficients h and s, Eq. (2) and (3), that fit all runs best by their clocks
         for row, channel in enumerate(windows[0].channels):
-            columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
+            columns = np.concatenate([counts[chosen, channel] for counts, chosen in zip(changes, within, strict=True)])
             shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
             fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]

@@ -264,7 +264,7 @@ def read_cells(
 
 @dataclass(frozen=True, eq=False)
 class _Text:
-    """A delimited text. source: what polars reads, a file, a text in memory or a temporary file. lines: its lines."""
+    """A delimited text. source: a file, a text in memory or a temporary file. lines: their numbers in the file."""
 
     file: Path
     source: Path | bytes | Any

@@ -367,9 +367,6 @@ class TableFiles:
     references: Path | None = None
 
 
-PlaceOf = Callable[[str], Path | None]
-
-
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     alone = source.is_file()
@@ -441,7 +438,11 @@ def _by_ending(source: Path, files: Sequence[Path], endings: Sequence[str]) -> d
 
 
 def _by_headers(
-    source: Path, tables: Sequence[Path], references: PlaceOf, options: CsvOptions, notes: list[str]
+    source: Path,
+    tables: Sequence[Path],
+    references: Callable[[str], Path | None],
+    options: CsvOptions,
+    notes: list[str],
 ) -> list[TableFiles]:
     """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references.
 
@@ -736,7 +737,8 @@ class Csv(Importer):
         of_references = filter(None, dict.fromkeys(each.references for each in files))
         measured = {file: by_run(load(file, as_tables).in_lower_case(), options) for file in of_references}
         attributes = read_run_attributes(source, options, notes)
-        names, users = list[str](), Counter[Path | None]()  # of the recordings, and of tables of references
+        names = list[str]()
+        users = Counter[Path | None]()  # number of recordings by their table of references
 
         def read() -> Iterator[Recording]:
             if size > delimited.LARGE:
