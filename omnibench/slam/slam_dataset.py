@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -425,8 +426,8 @@ def slam_paths(
         return Job(content_key({"run": run, "scans": recorded, **facts}), _locate, argument)
 
     paths = _Paths(dataset, watch)
-    with TemporaryDirectory(prefix="omnibench-slam-") as temporary:
-        store = ResultStore(folder or Path(temporary), SlamPath)
+    with nullcontext(folder) if folder else TemporaryDirectory(prefix="omnibench-slam-") as place:
+        store = ResultStore(Path(place), SlamPath)
         backend = local_backend(min(workers, len(dataset.trajectories)), PRELOAD)
         run_jobs(map(job, dataset.trajectories), store, backend, paths)
     return [paths.found[number] for number in range(len(dataset.trajectories))]

@@ -2,6 +2,7 @@
 
 import math
 import re
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -38,6 +39,7 @@ from omnibench.slam.slam_dataset import (
     run_slam,
     slam_accuracy,
     slam_dataset,
+    slam_paths,
 )
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.testing.synthetic import synthetic_dataset
@@ -583,6 +585,14 @@ def test_poses_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans_and_a
         assert after.command == before.command
         np.testing.assert_array_equal(after.rates, before.rates)
     assert found.warnings == ()
+
+
+def test_paths_that_have_a_folder_need_no_temporary_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = found_alone()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
+    paths = slam_paths(recorded()[0], SlamOptions(), workers=1, folder=tmp_path / "paths")
+    for path, run in zip(paths, alone.trajectories, strict=True):
+        np.testing.assert_array_equal(path.poses, run.poses)
 
 
 def test_poses_do_not_depend_on_the_number_of_processes_and_progress_is_told_run_by_run() -> None:
