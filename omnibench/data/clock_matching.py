@@ -135,9 +135,9 @@ def fitted_together(windows: Sequence[Windows], search: float) -> tuple[list[Arr
     for _ in range(ROUNDS):
         before, within = clocks, [each.within(clock) for each, clock in zip(windows, clocks, strict=True)]
         changes = [each.columns(clock)[0] for each, clock in zip(windows, clocks, strict=True)]
-        fitted = []  # the coefficients that fit all runs best by their clocks
+        fitted = []  # the coefficients h and s, Eq. (2) and (3), that fit all runs best by their clocks
         for row, channel in enumerate(windows[0].channels):
-            columns = np.concatenate([every[chosen, channel] for every, chosen in zip(changes, within, strict=True)])
+            columns = np.concatenate([counts[chosen, channel] for counts, chosen in zip(changes, within, strict=True)])
             shown = np.concatenate([each.shown[row][chosen] for each, chosen in zip(windows, within, strict=True)])
             fitted.append(_solved(columns, shown, np.ones(len(shown), dtype=bool)))
         clocks = [each.improved(fitted, clock) for each, clock in zip(windows, clocks, strict=True)]
@@ -215,22 +215,21 @@ class Windows:
 
     def columns(self, clock: Clock, later: Array = _NOW) -> Array:
         """Changes (L, W, C) of what the wheels count over the windows, ``later`` (L,), s, than by a clock."""
-        taken = self._taken(clock) + later[:, None]
-        means = _means(_between(taken, self.edges, self.counted), self.starts)
+        times = self._pose_times(clock) + later[:, None]
+        means = _means(_between(times, self.edges, self.counted), self.starts)
         return np.asarray(means[:, self.last] - means[:, self.first])
 
-    def _taken(self, clock: Clock) -> Array:
-        """When the poses (K,) were taken by a clock, s."""
-        taken: Array = self.stamps + clock[0] + clock[1] * (self.stamps - self.middle)
-        return taken
+    def _pose_times(self, clock: Clock) -> Array:
+        """Times (K,) of the poses by the wheels' clock, s, Eq. (1); a drift counts from the run's middle."""
+        return self.stamps + clock[0] + clock[1] * (self.stamps - self.middle)
 
     def within(self, clock: Clock) -> NDArray[np.bool_]:
         """True (W,) for windows that lie within the wheels' samples by a clock."""
-        return self._inside(self._taken(clock)[self.starts])
+        return self._inside(self._pose_times(clock)[self.starts])
 
-    def _inside(self, taken: Array) -> NDArray[np.bool_]:
+    def _inside(self, begins: Array) -> NDArray[np.bool_]:
         """True (..., W) for windows whose bins begin, at times (..., B), within the wheels' samples."""
-        inside = (taken >= self.edges[0]) & (taken <= self.edges[-1] - _BIN)
+        inside = (begins >= self.edges[0]) & (begins <= self.edges[-1] - _BIN)
         return np.asarray(inside[..., self.first] & inside[..., self.last])
 
     def scanned(self, search: float, fitted: Sequence[Array] | None = None) -> Clock:
@@ -252,9 +251,9 @@ class Windows:
         shares = np.ones(len(offsets))
         for number, (channel, shown) in enumerate(zip(self.channels, self.shown, strict=True)):
             wanted = np.where(within, shown, 0.0)
-            told = columns[..., channel]
-            solved = _solved(told, wanted, within) if fitted is None else fitted[number]
-            left = np.where(within, shown - (told @ solved[..., None])[..., 0], 0.0)
+            counted = columns[..., channel]
+            solved = _solved(counted, wanted, within) if fitted is None else fitted[number]
+            left = np.where(within, shown - (counted @ solved[..., None])[..., 0], 0.0)
             whole = (wanted**2).sum(axis=1)
             share = np.maximum((left**2).sum(axis=1) / np.maximum(whole, 1e-300), 1e-9)
             shares *= np.where((whole > 0) & (number == 1 or not self.steers), share, 1.0)

@@ -174,7 +174,8 @@ class Table:
     def _parsed(self, name: str, column: pl.Series) -> Array:
         """Numbers, or texts as such; dates become seconds since 1970."""
         if column.dtype != pl.String:
-            numbers, wrong = column.cast(pl.Float64), pl.Series([False])
+            with readable(self.file):
+                numbers, wrong = column.cast(pl.Float64), pl.Series([False])
         else:
             cells = column.fill_null("").str.strip_chars()
             numbers = cells.cast(pl.Float64, strict=False)
@@ -263,7 +264,7 @@ def read_cells(
 
 @dataclass(frozen=True, eq=False)
 class _Text:
-    """A delimited text. source: what polars reads, a file, a text in memory or a temporary file. lines: its lines."""
+    """A delimited text. source: a file, a text in memory or a temporary file. lines: their numbers in the file."""
 
     file: Path
     source: Path | bytes | Any
@@ -301,7 +302,7 @@ class _Text:
                     if fields and len(fields) != len(numeric):
                         raise self.ragged(fields, numeric, skipped, row)
         except UnicodeDecodeError:
-            read_text(self.file)  # which says that it is no text
+            read_text(self.file)  # raises DataError: the file is no text in UTF-8
         raise DataError(f"{self.file}: cannot be read: {reason}")
 
     def ragged(self, fields: Sequence[str], names: Sequence[object], skipped: int, row: int) -> DataError:
@@ -312,7 +313,7 @@ class _Text:
 
 
 def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, list[str], Lines]:
-    """What polars reads of a file, its first lines, and the numbers of its lines, of which some may be left out."""
+    """The source that polars reads of a file, its first lines, and the numbers of the lines that are not left out."""
     check_file(file, _MOST_BYTES, text=True)
     try:
         with file.open(encoding="utf-8-sig", newline="") as opened:
@@ -332,7 +333,7 @@ def _source_of(file: Path, separator: str | None) -> tuple[Path | bytes | Any, l
                     numbers.append(number)
                     first += [fields] if len(first) < _HEADED else []
     except UnicodeDecodeError:
-        read_text(file)  # which says that it is no text
+        read_text(file)  # raises DataError: the file is no text in UTF-8
         raise
     cleaned.flush()
     return cleaned if large else cleaned.getvalue(), first, np.array(numbers)

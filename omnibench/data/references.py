@@ -78,12 +78,16 @@ class References(Brief):
         for each in given:
             require_type(each, Reference, "Reference(kind, value, sigma)")
         kinds = np.array([each.kind for each in given], dtype=str)
-        times = np.array([(each.t0, each.t1) for each in given], dtype=float).reshape(-1, 2).T  # NaN for None
-        values = np.array([np.resize(each.value, 2) for each in given], dtype=float).reshape(-1, 2).T
-        sigmas = np.array([np.resize(each.sigma, 2) for each in given], dtype=float).reshape(-1, 2).T
-        rows = (*times, values[0], *values, sigmas[0], *sigmas, np.zeros(len(given)))  # one number stands for both
-        measured = references_of(kinds, dict(zip(NUMBERS, rows, strict=True)), start_known=start_known)
-        return replace(measured, rate_sigma=rate_sigma).of_run(0.0, end).by_time()
+        # As of a run to come: -inf is its start, inf its end, and in the place of t0 the same time as t1.
+        starts = np.where(np.isin(kinds, list(AT_ONE_TIME)), np.inf, -np.inf).tolist()
+        t0 = [start if each.t0 is None else each.t0 for each, start in zip(given, starts, strict=True)]
+        t1 = [np.inf if each.t1 is None else each.t1 for each in given]
+        pairs = [(np.resize(each.value, 2), np.resize(each.sigma, 2)) for each in given]  # one number stands for both
+        values, sigmas = np.array(pairs, dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
+        times = np.array([t0, t1], dtype=float)
+        measured = cls(kinds, times[0], times[1], values, sigmas, start_known, rate_sigma)
+        values[~measured.planar, 1] = sigmas[~measured.planar, 1] = np.nan
+        return measured.of_run(0.0, end).by_time()
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -209,9 +213,9 @@ def with_whole_turns(robot: Robot, log: WheelLog, references: References) -> Ref
     counted = (references.kinds == "heading") & ~absolute
     for chosen, known, first in ((absolute, references.start_known, log.start[2]), (counted, True, 0.0)):
         if chosen.any():
-            begin = [0.0] * known  # the run's start, where it is known
+            begin, start = ([0.0], [first]) if known else ([], [])  # time and heading of the run's start
             wanted = replace(log, start=np.zeros(3), stamps=np.append(begin, references.t1[chosen]))
-            (headings,), _ = unwrap(robot, [wanted], [np.append([first] * known, values[chosen, 0])])
+            (headings,), _ = unwrap(robot, [wanted], [np.append(start, values[chosen, 0])])
             values[chosen, 0] = headings[len(begin) :]
     return replace(references, values=values)
 

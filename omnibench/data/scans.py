@@ -207,7 +207,7 @@ class ScansOnDisk(Scans):
         most = _MOST_ROWS if self.file.suffix == ".parquet" else _ROWS_OF_CSV
         edges = np.flatnonzero(np.diff(rows // most)) + 1
         for part in np.split(np.arange(len(rows)), edges):
-            wrong, first, last = partial(refuse, self.file, rows[part]), int(rows[part[0]]), int(rows[part[-1]])
+            check, first, last = partial(refuse, self.file, rows[part]), int(rows[part[0]]), int(rows[part[-1]])
             column = self._table.rows(["ranges"], first, last - first + 1)["ranges"][rows[part] - first]
             if isinstance(column.dtype, pl.Array):
                 column = column.arr.to_list()
@@ -215,14 +215,14 @@ class ScansOnDisk(Scans):
                 texts = column.str.strip_chars().str.split(" ")
                 column = texts.list.eval(pl.element().cast(pl.Float32, strict=False))
                 broken = texts.list.len() != column.list.drop_nulls().list.len()
-                wrong(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
+                check(broken.fill_null(value=False), "ranges must be numbers, in CSV with a blank between them")
             if not isinstance(column.dtype, pl.List) or not column.dtype.inner.is_numeric():
                 raise DataError(f"{self.file}: column 'ranges' holds {column.dtype}, expected lists of numbers")
             lengths = column.list.len().fill_null(0)
-            wrong(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
+            check(lengths != rays, f"the scan has {{}} ranges, but scanner.rays is {rays}", lengths)
             ranges[part] = column.explode().cast(pl.Float32).fill_null(np.nan).to_numpy().reshape(-1, rays)
             unknown = np.isnan(ranges[part]).any(axis=1)
-            wrong(unknown, "a range is missing or NaN; write inf where nothing was seen")
+            check(unknown, "a range is missing or NaN; write inf where nothing was seen")
         empty = ~self.scanner.valid(ranges).any(axis=1)
         for row in np.flatnonzero(empty)[:1].tolist():
             seen = ranges[row][np.isfinite(ranges[row])]

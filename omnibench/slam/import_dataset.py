@@ -25,11 +25,11 @@ def import_dataset(name: str, source: Path | str, options: Mapping[str, Any] | N
     check_source(source)
     importer, again = importer_of(name, source, options or {})
     slam = validate(SlamOptions, getattr(importer.options, "slam", {}), f"importer {name!r}: slam")
-    dataset = read_dataset(importer, source, again)
-    if not dataset.referenced:
+    recorded = dataset = read_dataset(importer, source, again)
+    if not recorded.referenced:
         from omnibench.slam.slam_dataset import slam_dataset  # small_gicp and numba, which other recordings do without
 
         made = f"{source}: reference poses were made from the scans by SLAM, because the recording holds none"
-        recorded, dataset = dataset, slam_dataset(dataset, slam)
+        dataset = slam_dataset(recorded, slam)
         dataset = replace(dataset, warnings=(*recorded.warnings, made, *dataset.warnings))
     return replace(dataset, imported=Imported.of(name, source, options or {}))

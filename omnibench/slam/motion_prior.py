@@ -49,6 +49,12 @@ class MotionWithinScan:
         return self.duration ** np.arange(len(self.coefficients)) @ self.coefficients
 
 
+def poses_at(odometry: Callable[[Array], Array], times: Array) -> Array:
+    """Poses (..., 3) at times (...), s, of an odometry that takes increasing times."""
+    stamps, place = np.unique(times, return_inverse=True)
+    return odometry(stamps)[place.reshape(times.shape)]
+
+
 def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) -> tuple[list[MotionWithinScan], Array]:
     """The motion within each scan, and standard deviations (3,) of the odometry's poses about the fit, m, m, rad.
 
@@ -60,7 +66,7 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     count = 2 + int((_AROUND + duration) / _INSTANT)
     delays = np.linspace(-_AROUND / 2, duration + _AROUND / 2, count)
     delays = np.maximum(times[:, None] + delays, 0.0) - times[:, None]  # (S, count)
-    poses = odometry(np.column_stack([times, times[:, None] + delays]).ravel()).reshape(len(times), -1, 3)
+    poses = poses_at(odometry, np.column_stack([times, times[:, None] + delays]))
     motions = unit_twist(relative(poses[:, 0][:, None], poses[:, 1:]))
     basis = np.concatenate([np.ones((*delays.shape, 1)), _powers(delays, _DEGREE)], axis=2)
     inverse = np.linalg.pinv(basis)
@@ -72,8 +78,8 @@ def smoothed(odometry: Callable[[Array], Array], times: Array, duration: float) 
     parts = duration * np.linspace(0.2, 1.0, 5)
     means = parts[:, None] ** np.arange(_DEGREE) @ inverse[:, 1:]  # twists of parts of the scan: (S, 5, count)
     deviations = np.sqrt(_ALIKE * (means**2).sum(axis=2).mean(axis=1)[:, None] * squares)
-    scans = zip(fitted, deviations, strict=True)
-    return [MotionWithinScan(each[1:], duration, of_scan) for each, of_scan in scans], np.sqrt(coarse)
+    scans = zip(fitted[:, 1:], deviations, strict=True)
+    return [MotionWithinScan(powers, duration, errors) for powers, errors in scans], np.sqrt(coarse)
 
 
 def _powers(delays: Array, count: int) -> Array:
@@ -104,11 +110,11 @@ class MotionPrediction(NamedTuple):
 class OdometryPrior:
     """Prior from odometry, which may be uncalibrated (wrong in scale and direction by a few per cent) and coarse.
 
-    odometry: poses (K, 3) at times (K,), s, in any order. times (S,): of the scans, s. duration: of a scan, s.
+    odometry: poses (K, 3) at increasing times (K,), s. times (S,): of the scans, s. duration: of a scan, s.
     """
 
     def __init__(self, odometry: Callable[[Array], Array], times: Array, duration: float, options: SlamOptions) -> None:
-        self._poses, self._error = odometry(times), options.odometry_error
+        self._poses, self._error = poses_at(odometry, times), options.odometry_error
         self._within, self._coarse = smoothed(odometry, times, duration)
         self._periods, self._duration = np.diff(times, prepend=times[0]), duration
 

@@ -445,8 +445,8 @@ def refine(
         inverses = np.divide(1.0, values, out=np.zeros(3), where=informative)
         weight = (limits[:, None] * directions) @ ((observability * inverses)[:, None] * directions.T) * limits
         pose = start + gain @ (pose - start) - weight @ pairs.gradient()
-    errors = pairs.by_keyframe(), pairs.scatter(), pairs.delayed()
-    return Match(pose, gain, observability, directions, weight, information, *errors, pairs.matched)
+    by_keyframe, scatter, late = pairs.by_keyframe(), pairs.scatter(), pairs.delayed()
+    return Match(pose, gain, observability, directions, weight, information, by_keyframe, scatter, late, pairs.matched)
 
 
 def _observability(pairs: Correspondences, directions: Array, information: Array) -> Array:

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -257,7 +258,7 @@ def run_slam(
 ) -> SlamPath:
     """The poses at which a run's scans lie best on the map that they make.
 
-    start (3,): the robot's pose at the first scan. odometry: function from times (K,) >= 0, s, in any order, to poses
+    start (3,): the robot's pose at the first scan. odometry: function from increasing times (K,) >= 0, s, to poses
     (K, 3) in any frame. Only its increments are used: to start the search, to deskew, and along directions that scans
     do not measure. It is needed unless the search starts from the last pose. deviations (3,): standard deviations of
     the start pose along the robot's axes, m, m, rad; default: it is exact. DataError in one line: no scan, or one
@@ -288,7 +289,8 @@ def run_slam(
     located += [slam.go_on(number, ranges) for number, ranges in enumerate(scans.ranges[1:], 1)]
     matches, covariances = zip(*located, strict=True)
     poses, matched = (np.array([getattr(match, name) for match in matches]) for name in ("pose", "matched"))
-    warnings = path_warnings(matches, options, None if odometry is None else odometry(scans.times))
+    driven = None if odometry is None else motion_prior.poses_at(odometry, scans.times)
+    warnings = path_warnings(matches, options, driven)
     return SlamPath(scans.times, poses, np.array(covariances), matched, tuple(warnings))
 
 
@@ -424,8 +426,8 @@ def slam_paths(
         return Job(content_key({"run": run, "scans": recorded, **facts}), _locate, argument)
 
     paths = _Paths(dataset, watch)
-    with TemporaryDirectory(prefix="omnibench-slam-") as temporary:
-        store = ResultStore(folder or Path(temporary), SlamPath)
+    with nullcontext(folder) if folder else TemporaryDirectory(prefix="omnibench-slam-") as place:
+        store = ResultStore(Path(place), SlamPath)
         backend = local_backend(min(workers, len(dataset.trajectories)), PRELOAD)
         run_jobs(map(job, dataset.trajectories), store, backend, paths)
     return [paths.found[number] for number in range(len(dataset.trajectories))]
@@ -490,8 +492,7 @@ def _locate(
     scans = TrajectoryScans(np.maximum(recorded.times[kept], 0.0), recorded.ranges[kept])
 
     def odometry(times: Array) -> Array:
-        stamps, place = np.unique(times, return_inverse=True)
-        return model.poses([trajectory.log(stamps)])[0][place]
+        return model.poses([trajectory.log(times)])[0]
 
     try:
         if not len(scans.times):

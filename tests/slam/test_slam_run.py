@@ -2,6 +2,7 @@
 
 import math
 import re
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -38,6 +39,7 @@ from omnibench.slam.slam_dataset import (
     run_slam,
     slam_accuracy,
     slam_dataset,
+    slam_paths,
 )
 from omnibench.slam.slam_options import SlamOptions
 from omnibench.testing.synthetic import synthetic_dataset
@@ -263,6 +265,18 @@ def test_a_scan_with_a_few_returns_keeps_the_start_and_says_so() -> None:
 def test_ranges_noisier_than_the_scanner_says_are_noticed() -> None:
     runs = [driven("furnished_room", number, Lidar(noise=0.03, far_noise=0.06)) for number in range(4)]
     assert np.mean([nees(located(run), run).mean() for run in runs]) < 5
+
+
+def test_the_odometry_is_asked_for_increasing_times() -> None:
+    run = driven("furnished_room", 4)
+
+    def increasing(times: Array) -> Array:
+        assert (np.diff(times) > 0).all()
+        return run.odometry(times)
+
+    for options in (DEFAULT, LAST_POSE):
+        found = run_slam(run.scans, LIDAR.scanner, options, np.zeros(3), increasing)
+        np.testing.assert_array_equal(found.poses, located(run, options).poses)
 
 
 def test_what_cannot_be_located_is_named() -> None:
@@ -571,6 +585,14 @@ def test_poses_are_found_from_the_start_pose_on_at_the_stamps_of_the_scans_and_a
         assert after.command == before.command
         np.testing.assert_array_equal(after.rates, before.rates)
     assert found.warnings == ()
+
+
+def test_paths_that_have_a_folder_need_no_temporary_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = found_alone()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
+    paths = slam_paths(recorded()[0], SlamOptions(), workers=1, folder=tmp_path / "paths")
+    for path, run in zip(paths, alone.trajectories, strict=True):
+        np.testing.assert_array_equal(path.poses, run.poses)
 
 
 def test_poses_do_not_depend_on_the_number_of_processes_and_progress_is_told_run_by_run() -> None:

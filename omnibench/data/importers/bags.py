@@ -247,7 +247,7 @@ def open_bag(
             package = folder.parent.name if folder.name == "msg" else folder.name
             try:
                 given |= get_types_from_msg(text, f"{package}/msg/{file.stem}")
-            except Exception as error:  # of rosbags' parser
+            except Exception as error:  # rosbags' parser raises several types
                 raise DataError(f"{file}: cannot be read as the definition of a message: {error}") from None
     store.fielddefs |= given
     with _damage_as_error(path):
@@ -258,8 +258,9 @@ def open_bag(
                 check_file(file)
         reader = AnyReader([path], default_typestore=store)
         reader.open()
-        read = reader.typestore.fielddefs
-        reader.typestore.register({name: fields for name, fields in given.items() if name not in read})
+        if given:  # and types of ROS that they are made of
+            read = reader.typestore.fielddefs
+            reader.typestore.register({name: fields for name, fields in store.fielddefs.items() if name not in read})
     try:
         yield Bag(path, reader, recorded, definitions, notes)
     finally:

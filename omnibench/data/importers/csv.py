@@ -52,7 +52,7 @@ HEADINGS = ("theta", "heading", "yaw")
 QUATERNION = ("qx", "qy", "qz", "qw")
 RUNS = ("run", "trajectory", "trial", "experiment")
 PREFIXES = ("omega_", "ticks_", "phi_")
-"""Of the columns of wheels: rates, positions or increments in ticks, and those in other units."""
+"""Prefixes of the wheels' columns: rates, positions or increments in ticks, and those in other units."""
 
 
 def _as_separator(value: str) -> str:
@@ -107,7 +107,7 @@ class CsvOptions(ReferenceOptions):
 
     @property
     def prefix(self) -> str:
-        """What the columns of the wheels begin with, by their unit."""
+        """Prefix of the wheels' columns, by their unit."""
         rates, ticks, angles = PREFIXES
         return rates if self.quantity == "rates" else ticks if "ticks" in self.wheel_unit else angles
 
@@ -285,7 +285,7 @@ def missing_error(table: Table, missing: Sequence[str], options: CsvOptions) -> 
 
 
 def _way_out(table: Table, missing: Sequence[str], options: CsvOptions) -> str:
-    """What to type to name the columns that are missing: by what looks like them, or by an example."""
+    """Options to type for the columns that are missing: columns that look like them, or an example."""
     for first in range(len(table.names)):
         if table.names[first : first + len(_MOTIVE)] == _MOTIVE and "theta" in missing:
             numbers = enumerate(("pose_t", *QUATERNION, "x", "y", "z"), first)
@@ -304,27 +304,27 @@ def _way_out(table: Table, missing: Sequence[str], options: CsvOptions) -> str:
     turns = [name for name, said in words.items() if not _TURNS.isdisjoint(said) and said[-1] in "xyzw"]
     turns.sort(key=lambda name: "xyzw".index(words[name][-1]))
     used = {*turns, *(found[key] for key in (*wheels, *poses) if key in found)}
-    taken: dict[str, str] = {}
+    likely: dict[str, str] = {}
     for key in sorted(missing, key=lambda key: key != "theta"):  # it is told by its name alone
-        free = {name: said for name, said in words.items() if name not in {*used, *taken.values()}}
-        beside = {word for name in (*taken.values(), *options.columns.values()) for word in words_of(name)[:-1]}
+        free = {name: said for name, said in words.items() if name not in {*used, *likely.values()}}
+        beside = {word for name in (*likely.values(), *options.columns.values()) for word in words_of(name)[:-1]}
         if key == "theta" and len(turns) == len(QUATERNION):
-            taken |= zip(QUATERNION, turns, strict=True)
-        elif (likely := _likely(key, free, options, beside)) is not None:
-            taken[key] = likely
+            likely |= zip(QUATERNION, turns, strict=True)
+        elif (column := _likely(key, free, options, beside)) is not None:
+            likely[key] = column
     shared = any(key in missing or key in found for key in wheels[1:])
     time = wheels[0] if shared else poses[0]
-    named = taken | {key: found[key] for key in (time,) if key in found}
+    named = likely | {key: found[key] for key in (time,) if key in found}
     settings = list(unit_options(named, table, options, shared=shared))
-    if any(delimited.DECIMAL_COMMA.fullmatch(cell) for name in taken.values() for cell in table.texts(name)[:100]):
+    if any(delimited.DECIMAL_COMMA.fullmatch(cell) for name in likely.values() for cell in table.texts(name)[:100]):
         settings.append("decimal=comma")
-    if not joints.isdisjoint(taken.values()):
+    if not joints.isdisjoint(likely.values()):
         settings = list(dict.fromkeys([*settings, "wheel_unit=rad", "wheel_time_unit=ns"]))
     typed = "".join(f" --set {setting}" for setting in settings)
-    keys = [each for key in missing for each in (QUATERNION if key == "theta" and "qw" in taken else (key,))]
-    quoted = {name: name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'" for name in taken.values()}
-    shown = ", ".join(f"{key}: {quoted[taken[key]] if key in taken else 'NAME'}" for key in keys)
-    if taken.keys() >= {*keys}:
+    keys = [each for key in missing for each in (QUATERNION if key == "theta" and "qw" in likely else (key,))]
+    quoted = {name: name if as_yaml(name) == name else "'" + name.replace("'", "''") + "'" for name in likely.values()}
+    shown = ", ".join(f"{key}: {quoted[likely[key]] if key in likely else 'NAME'}" for key in keys)
+    if likely.keys() >= {*keys}:
         return f'did you mean --set "columns={{{shown}}}"{typed}?'
     way = f'name {"it" if len(keys) == 1 else "them"}: --set "columns={{{shown}}}"{typed}'
     without = ", or put positions without headings into a table RUN_references.csv (omnibench guide references)"
@@ -367,9 +367,6 @@ class TableFiles:
     references: Path | None = None
 
 
-PlaceOf = Callable[[str], Path | None]
-
-
 def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     alone = source.is_file()
@@ -379,7 +376,7 @@ def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[Tab
     pose_endings = (options.pose_suffix,) if options.pose_suffix else POSE_ENDINGS
     wheels = _by_ending(folder, [source] if alone else files, wheel_endings)
     poses, measured = (_by_ending(folder, files, endings) for endings in (pose_endings, REFERENCE_ENDINGS))
-    common = file_called(folder, [ending.lstrip("_") for ending in REFERENCE_ENDINGS])  # of all runs
+    common = file_called(folder, [ending.lstrip("_") for ending in REFERENCE_ENDINGS])  # one table for all runs
     pairs = [
         TableFiles(name, wheels[name], poses.get(name), measured.get(name, common))
         for name in sorted(wheels)
@@ -441,7 +438,11 @@ def _by_ending(source: Path, files: Sequence[Path], endings: Sequence[str]) -> d
 
 
 def _by_headers(
-    source: Path, tables: Sequence[Path], references: PlaceOf, options: CsvOptions, notes: list[str]
+    source: Path,
+    tables: Sequence[Path],
+    references: Callable[[str], Path | None],
+    options: CsvOptions,
+    notes: list[str],
 ) -> list[TableFiles]:
     """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references.
 
@@ -603,8 +604,8 @@ def _recordings(
         name = files.name if run is None or (several and len(runs) == 1) else f"{files.name}/{run}" if several else run
         if run not in wheels and None not in wheels:
             raise DataError(f"{files.wheels}: run {run!r} has no wheels; add them, or take it out of the other table")
-        told, placed = measured.get(None, measured.get(name)), poses.get(run, poses.get(None))
-        references, seen = None if told is None else read_measured(told), None
+        rows, placed = measured.get(None, measured.get(name)), poses.get(run, poses.get(None))
+        references, seen = None if rows is None else read_measured(rows), None
         readings = _wheels(streams[0], wheels.get(run) or wheels[None], options, notes)
         if files.poses is not None and files.poses.suffix == ".tum":
             track = read_tum(files.poses)
@@ -647,7 +648,7 @@ def _poses(stream: Stream, table: Table, options: CsvOptions, notes: list[str]) 
 
 
 def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> Attributes:
-    """What a table of runs says of each run, by its name; empty without one. DataError names the row of a flaw."""
+    """Attributes of each run in a table of runs, by its name; empty without one. DataError names the row of a flaw."""
     folder = source if source.is_dir() else source.parent
     file = options.runs_table or file_called(folder, RUN_TABLES, other_than=source)
     if file is None:
@@ -736,7 +737,8 @@ class Csv(Importer):
         of_references = filter(None, dict.fromkeys(each.references for each in files))
         measured = {file: by_run(load(file, as_tables).in_lower_case(), options) for file in of_references}
         attributes = read_run_attributes(source, options, notes)
-        names, users = list[str](), Counter[Path | None]()  # of the recordings, and of tables of references
+        names = list[str]()
+        users = Counter[Path | None]()  # number of recordings by their table of references
 
         def read() -> Iterator[Recording]:
             if size > delimited.LARGE:

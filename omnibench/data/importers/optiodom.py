@@ -121,9 +121,9 @@ def read_metadata(file: Path) -> Session:
             numbers[key] = tuple(map(float, texts[key]))
         except ValueError:
             numbers[key] = ()
-        least = -math.inf if key == "odo_ti" else 0.0
+        least, above = (-math.inf, "") if key == "odo_ti" else (0.0, " above 0")
         if len(numbers[key]) != count or not all(least < number < math.inf for number in numbers[key]):
-            raise DataError(f"{file}: {key} is {', '.join(texts[key])}, expected {count} numbers above 0")
+            raise DataError(f"{file}: {key} is {', '.join(texts[key])}, expected {count} numbers{above}")
     name = file.name.removesuffix("_metadata.csv")
     files = sorted(file.parent.glob(f"{name}_run-*.csv"))
     runs = {int(match[1]): path for path in files if (match := _RUN.search(path.name))}

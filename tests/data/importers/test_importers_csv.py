@@ -395,6 +395,16 @@ def test_dates_in_parquet_files_are_seconds(tmp_path: Path) -> None:
     assert odometry_error(data) < FITS
 
 
+@pytest.mark.parametrize("kind", [pl.Categorical, pl.Binary])
+def test_a_column_of_parquet_that_holds_no_numbers_is_refused_in_one_line(tmp_path: Path, kind: type) -> None:
+    write_exact(tmp_path)
+    table = pl.read_csv(tmp_path / "run1_wheels.csv")
+    (tmp_path / "run1_wheels.csv").unlink()
+    table.with_columns(pl.nth(1).cast(pl.String).cast(kind)).write_parquet(tmp_path / "run1_wheels.parquet")
+    with refused(DataError, match=r"run1_wheels\.parquet: cannot be read: "):
+        read(tmp_path)
+
+
 def test_positions_without_headings_are_shown_the_table_that_takes_them(tmp_path: Path) -> None:
     write_exact(tmp_path)
     file = tmp_path / "run1_poses.csv"

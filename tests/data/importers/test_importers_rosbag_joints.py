@@ -612,6 +612,17 @@ def test_definitions_may_be_given_of_types_that_a_bag_does_not_define(tmp_path: 
         read(source, message_definitions=[str(tmp_path / "share")], **options)
 
 
+def test_definitions_may_hold_messages_of_ros_that_a_bag_does_not_define(tmp_path: Path) -> None:
+    source = write_rosbag2(tmp_path / "drive", [*WHEELS_ONLY, *located()])
+    with sqlite3.connect(source / "drive.db3") as connection:
+        connection.execute("DELETE FROM message_definitions WHERE topic_type = 'base_msgs/msg/Located'")
+    folder = tmp_path / "base_msgs"
+    folder.mkdir()
+    (folder / "Located.msg").write_text(DEFINITIONS["base_msgs/msg/Located"])
+    data = read(source, message_definitions=str(folder), pose_topic="/camera", pose_columns=["place"])
+    assert len(data.trajectories) == len(DRIVE.begins)
+
+
 def twists(
     sent: Sequence[tuple[float, float, float]], topic: str = "/robot/cmd_vel", stamped: bool = False
 ) -> list[Sent]:
