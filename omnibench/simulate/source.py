@@ -295,8 +295,8 @@ class SimulationRequest:
         elif self.model is None:
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
-            of_configs = {f"CONFIG {self.config}": self.config, "--truth": self.truth, "--dataset": self.dataset}
-            of_configs["--effect"] = self.effects or None
+            of_configs: dict[str, object] = {f"CONFIG {self.config}": self.config, "--truth": self.truth}
+            of_configs |= {"--dataset": self.dataset, "--effect": self.effects or None}
             _refuse(of_configs, "does not go with --like, which takes all from the recording and the calibration")
             if self.seed is not None and not self.noise:
                 raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
