@@ -228,7 +228,7 @@ class CandidatePool:
         return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
 
 
-# What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
+# Shapes of the runs that are offered; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
 _MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
