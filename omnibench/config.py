@@ -256,4 +256,6 @@ def as_yaml(value: Any) -> str:
         return value if plain and parse_yaml(value, "value") == value else json.dumps(value)
     if isinstance(value, list | tuple):
         return f"[{','.join(as_yaml(item) for item in value)}]"
-    return json.dumps(int(value) if isinstance(value, float) and value.is_integer() else value)
+    if isinstance(value, bool | Mapping | None):
+        return json.dumps(value)
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value)

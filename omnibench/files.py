@@ -152,9 +152,9 @@ def results_locked(folder: Path) -> Iterator[None]:
     import fcntl
 
     check_place(folder)
-    with ExitStack() as lock:
+    with ExitStack() as lock, ExitStack() as made:  # an empty folder goes while it is locked
         try:
-            lock.enter_context(_folder_made(folder))
+            made.enter_context(_folder_made(folder))
             descriptor = os.open(folder, os.O_RDONLY)
         except OSError as error:
             raise not_written(folder, error) from None
@@ -293,7 +293,7 @@ def check_results_folder(folder: Path, mark: str, kind: str, *, force: bool = Fa
     except DataError:
         ours = False
     if not ours:
-        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier {kind}, or --force")
+        raise DataError(f"{folder}: holds other files; name a new folder, or one of an earlier {kind}, or add --force")
 
 
 def new_results_folder(parent: Path) -> Path:

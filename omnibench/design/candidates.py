@@ -30,7 +30,7 @@ from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate import commands as motion
-from omnibench.simulate.commands import Command, TimedCommand
+from omnibench.simulate.commands import Command, Shapes, TimedCommand
 from omnibench.simulate.config import RobotConfig, SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
@@ -122,7 +122,7 @@ class DesignConfig(Model):
             if not commands:
                 raise ValueError(f"sets.{name}: no command moves the robot")
             limit = motion.steering_limit(self.robot, self.steering_limit_deg)
-            beyond = [each.command for each in commands if not motion.is_within(self.robot, each.command, limit)]
+            beyond = [timed.command for timed in commands if not motion.is_within(self.robot, timed.command, limit)]
             if beyond:
                 why = motion.beyond_steering(self.robot, beyond, limit)
                 raise ValueError(f"sets.{name}: {why}; take such commands out")
@@ -228,8 +228,8 @@ class CandidatePool:
         return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
 
 
-# What follows offers shapes of runs; more of them change a design little, because it is a choice of few (chosen).
-_SHAPES = motion.Shapes((0.5, 1.0), (0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
+# Shapes of the runs that are offered; more of them change a design little, because it is a choice of few (chosen).
+_SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
 # deg, m, deg: more is a slip of the pen.
 _MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"

@@ -184,8 +184,8 @@ class DesignProblem:
     def __init__(self, pool: CandidatePool, use: Use, per: Per, repetitions: int | None) -> None:
         self.pool, self.use, self.per, self.repetitions = pool, use, per, repetitions
         self.described = tuple(_described(candidate, pool.robot) for candidate in pool.candidates)
-        costs = ({"run": 1.0, "second": each.duration_s, "metre": each.rolled_m}[per] for each in self.described)
-        self.costs = np.array([*costs])
+        efforts = [{"run": 1.0, "second": run.duration_s, "metre": run.rolled_m} for run in self.described]
+        self.costs = np.array([effort[per] for effort in efforts])
         directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
         self.information = {name: self._information(name) for name in USES}

@@ -249,7 +249,7 @@ class CalibrationProblem:
             if not self._evaluator_tried and self._repays_building(len(candidates) - count):
                 self.build_evaluator()
             part = candidates[count : count + self._part_size]
-            of_part = self._costs(part, self._evaluator) if self._evaluator else self.values(part)
+            of_part = self._costs(part, self._evaluator)
             values[count : count + len(part)] = of_part
             if (of_part < self.best_cost).any():
                 eligible = np.where(np.isfinite(of_part) & self.inside(part), of_part, np.inf)
@@ -270,7 +270,7 @@ class CalibrationProblem:
 
     def answer_cost(self, vector: Array) -> float:
         """Cost of an answer (n,) by direct integration; it is no candidate, and not counted."""
-        return float(self.values(vector[None])[0])
+        return float(self._costs(vector[None], None)[0])
 
     def build_evaluator(self) -> RunsEvaluator | None:
         """Build the fast evaluator, which ``cost`` then uses in the place of direct integration, and return it.

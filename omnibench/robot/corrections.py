@@ -18,7 +18,7 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import WheelLog
 from omnibench.robot.signals import Signals, needed, signals_of
 
-# What of a log effects may need, where it stands there, and what is missing without it, in words
+# Attribute of a log for each need of an effect, and words for it where the log lacks it
 _MISSING: dict[Need, tuple[str, str]] = {
     "wheel_angles": ("wheel_angles", "absolute wheel angles (phi_* in wheels), which were not recorded"),
     "session_time": (

@@ -481,7 +481,7 @@ class Robot(Shown, Model):
 
     name: Name
     wheels: tuple[Wheel, ...] = Field(min_length=1)
-    # What is not said is not written either, so that files, hashes and documents of earlier versions stay as they were.
+    # Not written where they are not given, so that files, hashes and documents of earlier versions stay as they were.
     mount: Mount | None = Field(
         None, description="the tracked point in the robot's frame; default: its centre", exclude_if=operator.not_
     )

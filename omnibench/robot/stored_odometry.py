@@ -204,7 +204,8 @@ def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, b
     logs, matrices, integration, slopes = task
     parts = []
     for part in together(logs):
-        samples, signals = RunSamples.of([log.times for log in part]), np.concatenate([log.signals for log in part])
+        samples = RunSamples.of([log.times for log in part])
+        signals = np.ascontiguousarray(np.concatenate([log.signals for log in part]))
         edges = np.cumsum([0, *(len(log.stamps) for log in part)])
         stamps, count, size = np.concatenate([log.stamps for log in part]), int(edges[-1]), signals.shape[1]
         sums = []
@@ -212,8 +213,8 @@ def sums_of_logs(task: tuple[Sequence[WheelLog], Sequence[Array], Integration, b
             moved, driven = np.empty((count, 2)), np.empty((count, size))
             rows = np.empty((2, count if slopes else 1, size), dtype=complex)
             path_sums(
-                samples.times, np.ascontiguousarray(signals), samples.edges, stamps, edges,
-                np.ascontiguousarray(matrix), integration == "arc", slopes, moved, rows[0], rows[1], driven,
+                samples.times, signals, samples.edges, stamps, edges, np.ascontiguousarray(matrix),
+                integration == "arc", slopes, moved, rows[0], rows[1], driven,
             )  # fmt: skip
             sums.append(AtStamps(moved, driven, rows.view(float) if slopes else None))
         parts.append(sums)

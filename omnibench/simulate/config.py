@@ -87,13 +87,13 @@ class Truth(Model):
             raise ValueError(f"truth.matrix must have 3 rows of {len(signals)} values{of}")
         if self.published is not None and not (len(robot.wheels) == len(signals) == 3 and robot.drive.direct):
             raise ValueError("truth.published matrices are for three wheels")
-        given = self.tolerances or Tolerances()
+        tolerances = self.tolerances or Tolerances()
         placed_by_distance = [wheel.distance is not None for wheel in robot.wheels]
-        if given.distance and not all(placed_by_distance):
+        if tolerances.distance and not all(placed_by_distance):
             raise ValueError("truth.tolerances.distance: wheels that are placed by x and y have position (m) instead")
-        if given.position and all(placed_by_distance):
+        if tolerances.position and all(placed_by_distance):
             raise ValueError("truth.tolerances.position: these wheels have no x and y; give distance (relative)")
-        if given.steering_deg and not robot.drive.steered:
+        if tolerances.steering_deg and not robot.drive.steered:
             raise ValueError("truth.tolerances.steering_deg: no steering angle of this robot is measured; leave it out")
         if self.lateral_friction and not (robot.skid and self.tolerances):
             raise ValueError("truth.lateral_friction: is for a robot with skid: true and truth.tolerances")

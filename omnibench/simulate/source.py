@@ -285,8 +285,6 @@ class SimulationRequest:
     force: bool = False
 
     def __post_init__(self) -> None:
-        from_config = {"--truth": self.truth, "--dataset": self.dataset, "--effect": self.effects or None}
-        from_config[f"CONFIG {self.config}"] = self.config
         if self.like is None and self.model is None:
             if self.config is None:
                 raise ConfigError("name a CONFIG with a simulated data set, or --like DATASET --model CALIBRATION")
@@ -297,7 +295,9 @@ class SimulationRequest:
         elif self.model is None:
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
-            _refuse(from_config, "does not go with --like, which takes all from the recording and the calibration")
+            of_configs: dict[str, object] = {f"CONFIG {self.config}": self.config, "--truth": self.truth}
+            of_configs |= {"--dataset": self.dataset, "--effect": self.effects or None}
+            _refuse(of_configs, "does not go with --like, which takes all from the recording and the calibration")
             if self.seed is not None and not self.noise:
                 raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
             if resolved(self.output) == resolved(self.like):

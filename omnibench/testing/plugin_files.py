@@ -68,7 +68,7 @@ def new_plugin(
         raise ConfigError(f"{name!r} cannot name a plug-in; use lower-case letters, digits and _, as in my_search")
     if name.startswith(("_", "test_", "conftest")):
         raise ConfigError(f"{name!r} cannot name a plug-in; files that begin with _, test_ or conftest are not loaded")
-    targets = {Path(folder) / f"{kept}{name}.py": f"{kept}{kind}.py.txt" for kept in ("", "test_")}
+    targets = {Path(folder) / f"{start}{name}.py": f"{start}{kind}.py.txt" for start in ("", "test_")}
     refuse_existing(*targets, force=force)
     for registry in REGISTRIES:
         for entry in registry.entries() if registry.kind == kind else ():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.fit.cost import FinalPose
+from omnibench.fit.evaluator import RunsEvaluator
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.parameterisation import ParameterisationName
 from omnibench.fit.problem import Budget, BudgetSpent, CalibrationProblem, make_parameterisation
@@ -191,7 +192,6 @@ class ObservedProblem(CalibrationProblem):
         self.uncounted = 0
         self.refusals = 0
         self._undefined = undefined
-        self._counting = False
 
     def cost(self, candidates: Array) -> Array:
         """Costs (P,) as in every problem; records candidates outside the box and refused calls."""
@@ -200,31 +200,23 @@ class ObservedProblem(CalibrationProblem):
             self.strays.extend(vectors[np.logical_not(self.inside(vectors))])
         if self.refusals > _PATIENCE:
             raise Runaway
-        self._counting = True
         try:
             return super().cost(vectors)
         except BudgetSpent:
             self.refusals += 1
             raise
-        finally:
-            self._counting = False
 
     def values(self, candidates: Array) -> Array:
-        """Costs (P,) as in every problem, but NaN where the cost is undefined."""
-        if not self._counting:
-            self.uncounted += len(candidates)
-        values = super().values(candidates)
-        if self._undefined is not None:
-            values[self._undefined(self.to_unit(candidates))] = np.nan
-        return values
+        """Costs (P,) as in every problem; records how many."""
+        self.uncounted += len(candidates)
+        return super().values(candidates)
 
-    def answer_cost(self, vector: Array) -> float:
-        """As in every problem: an answer is no candidate."""
-        before = self.uncounted
-        try:
-            return super().answer_cost(vector)
-        finally:
-            self.uncounted = before
+    def _costs(self, candidates: Array, evaluator: RunsEvaluator | None) -> Array:
+        """Costs (P,) as in every problem, but NaN where the cost is undefined."""
+        costs = super()._costs(candidates, evaluator)
+        if self._undefined is not None:
+            costs[self._undefined(self.to_unit(candidates))] = np.nan
+        return costs
 
 
 def synthetic_problem(

@@ -300,6 +300,11 @@ def test_values_are_typed_so_that_they_are_read_as_they_are(names: list[str]) ->
     assert parse_settings([f"leave_out={as_yaml(names)}"]) == {"leave_out": names}
 
 
+def test_values_from_python_are_typed_as_their_text() -> None:
+    values = (Path("robots/a.yaml"), np.int64(3), 2.0, True)
+    assert list(map(as_yaml, values)) == ["robots/a.yaml", "3", "2", "true"]
+
+
 def test_a_data_set_in_memory_is_to_be_saved_before_its_fix_is_typed_whatever_folder_has_its_name() -> None:
     swapped = changed(lambda run: replace(run, rates=run.rates[:, ::-1]))
     alone = check(swapped)

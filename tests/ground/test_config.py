@@ -489,6 +489,15 @@ def test_a_folder_of_results_is_free_again_when_the_process_that_wrote_there_is_
         assert list(folder.iterdir()) == []
 
 
+def test_an_empty_folder_of_results_goes_while_it_is_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there: list[bool] = []
+    close = os.close
+    monkeypatch.setattr(os, "close", lambda lock: (there.append((tmp_path / "new").exists()), close(lock)))
+    with results_locked(tmp_path / "new"):
+        pass
+    assert there == [False]
+
+
 def test_a_file_is_on_the_disk_before_it_replaces_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, str]] = []
 

@@ -18,7 +18,7 @@ from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.importer import Importer
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, NotApplicableError, OmnibenchError, PluginError
-from omnibench.fit.calibrator import Calibrator, Solution
+from omnibench.fit.calibrator import Calibrator, Solution, run_calibrator
 from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.problem import BudgetSpent, CalibrationProblem
 from omnibench.registry import Options, effects, registered_from
@@ -70,6 +70,22 @@ class Honest(Calibrator):
     def step(self, problem: CalibrationProblem, normal: Array) -> None:
         points = problem.to_unit(problem.best_vector) + 0.1 * normal
         problem.cost(problem.from_unit(np.clip(points, 0, 1)))
+
+
+class Frozen(Honest):
+    """Takes no attributes."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        assert name == "options"
+        super().__setattr__(name, value)
+
+
+class BeginsWithAnother(Honest):
+    """Begins where another calibrator ends, whose answer is scored."""
+
+    def calibrate(self, problem: CalibrationProblem) -> Solution:
+        run_calibrator(Honest(self.options), problem)
+        return super().calibrate(problem)
 
 
 class IgnoresBounds(Honest):
@@ -263,8 +279,9 @@ CASES_OF_CALIBRATORS = [
 ]
 
 
-def test_an_honest_calibrator_passes_every_case() -> None:
-    assert failures(CalibratorConformance, Honest) == {}
+@pytest.mark.parametrize("cls", [Honest, Frozen, BeginsWithAnother])
+def test_an_honest_calibrator_passes_every_case(cls: type[Calibrator]) -> None:
+    assert failures(CalibratorConformance, cls) == {}
 
 
 @pytest.mark.parametrize(("cls", "case", "message"), CASES_OF_CALIBRATORS)
@@ -292,6 +309,12 @@ def test_the_synthetic_problem_can_be_solved_to_zero_within_its_box(parameterisa
     assert problem.values(vector[None])[0] < 1e-12
     assert problem.values(problem.start[None])[0] > 0.05
     assert (problem.free.sum() < problem.size) == (fixed and (parameterisation, wheels) != ("matrix", 4))
+
+
+def test_an_undefined_cost_is_nan_however_many_candidates_are_evaluated() -> None:
+    problem = synthetic_problem(undefined=lambda points: points[:, 0] > 0.5)
+    points = problem.rng.uniform(size=(100, problem.size))  # enough for the fast evaluator
+    np.testing.assert_array_equal(np.isnan(problem.cost(problem.from_unit(points))), points[:, 0] > 0.5)
 
 
 @pytest.mark.parametrize("robot", synthetic.synthetic_wheeled_robots(), ids=lambda robot: robot.name)

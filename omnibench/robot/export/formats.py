@@ -163,8 +163,7 @@ def _c_header(calibration: Calibration) -> Export:
         keep_trailing_newline=True,
     )
     templates.filters |= {
-        # A C literal that is read as exactly the same double
-        "literal": lambda value: text if "." in (text := f"{float(value):.17g}") or "e" in text else f"{text}.0",
+        "literal": _c_literal,
         "quoted": lambda names: ", ".join(f'"{name}"' for name in names),
         "in_comment": lambda text: " ".join(text.split()).replace("*/", "* /"),
     }
@@ -198,6 +197,12 @@ def _c_header(calibration: Calibration) -> Export:
     if robot.mount is not None:
         warnings.append("the header's pose is that of the tracked point, which is not the robot's centre (mount)")
     return Export(text, tuple(warnings), f"{prefix}_odometry.h")
+
+
+def _c_literal(value: float) -> str:
+    """A C literal that is read as exactly the same double."""
+    text = f"{value:.17g}"
+    return text if "." in text or "e" in text else f"{text}.0"
 
 
 def _header_is_plain(calibration: Calibration) -> bool:
