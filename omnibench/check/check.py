@@ -121,7 +121,7 @@ def check(
 
 
 def check_recording(read: RecordingSource) -> CheckReport:
-    """The check of a recording that was read.
+    """Check a recording that was read.
 
     Where mistakes explain its motion that options mend, other findings are looked for in what was meant.
     """

@@ -328,7 +328,7 @@ def _corrected(robot: Robot, wheels: Mapping[str, Mapping[str, Any]]) -> Robot |
 
 
 def _tracked_point(robot: Robot, fit: FreeFit) -> Array:
-    """Where the tracked point is (2,), m, beside where the design has it, by the matrix; NaN if nothing turns.
+    """Offset (2,), m, of the tracked point from its place in the design, by the matrix; NaN if nothing turns.
 
     A point at (x, y) of the robot has rows k1 - y k3 and k2 + x k3.
     """

@@ -341,9 +341,10 @@ def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
 
 @dataclass(frozen=True, eq=False)
 class _Moments:
-    """Some runs, at moments between which the robot turns by a radian: path since the start, turn since the last one.
+    """Runs at S moments, between which the robot turns by a radian.
 
-    odometry: of the logs at these moments. poses, starts (S, 3): of the reference, there and at the begin of the run.
+    odometry: of the logs, at these moments. poses (S, 3): of the reference, at these moments. starts (S, 3): pose of
+    the reference at the begin of each moment's run.
     """
 
     recording: Recorded

@@ -237,10 +237,7 @@ _PLACE = 0.1  # standard deviation of the tracked point's x and y, as a share of
 
 
 def usual_changes(robot: Robot) -> Array:
-    """What a standard deviation of each radius, of each row's gain and of the tracked point's yaw adds to the design.
-
-    (J, 3, M).
-    """
+    """Changes (J, 3, M) of the design by one standard deviation of each radius, row's gain and tracked point's yaw."""
     design = robot.inverse_kinematic_matrix
     columns = design.shape[1]
     lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]

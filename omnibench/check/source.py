@@ -103,7 +103,7 @@ class RecordingSource:
                 yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
 
     def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
-        """The recording as these findings mend it, which it then has; None if it cannot be read so."""
+        """The recording, read again with the options that mend these findings; None if it cannot be read so."""
         dataset = self.read_by(self.mended_options(findings))
         return None if dataset is None else replace(self, dataset=dataset, findings=tuple(findings))
 
@@ -247,7 +247,7 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
 
 
 def _title(source: Path) -> str:
-    """What a source is called: the name of a folder, or of a file without its ending."""
+    """The title of a source: the name of its folder, or of its file without the ending."""
     return source.name if source.is_dir() else source.stem
 
 

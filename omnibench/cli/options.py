@@ -54,16 +54,16 @@ def output_option(text: str, **settings: Any) -> Any:
 
 
 def grouped(function: Callable[..., None]) -> Callable[..., None]:
-    """A command's function, in which a parameter that is by default a group of options stands for all of these.
+    """Decorator of a command, for which a parameter that is a group of options by default adds all of them.
 
-    A group is a dataclass whose fields are options; the function gets one with the values that were given.
+    A group is a dataclass whose fields are options; the command gets one with the values that were given.
     """
     groups, parameters = dict[str, Any](), list[inspect.Parameter]()
     for parameter in inspect.signature(function).parameters.values():
         if not is_dataclass(group := parameter.default):
             parameters.append(parameter)
             continue
-        groups[parameter.name], types = group, get_type_hints(type(group), include_extras=True)
+        groups[parameter.name], types = group, get_type_hints(type(group))
         for field in fields(group):
             default = getattr(group, field.name)
             parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
@@ -78,7 +78,7 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _with_parameters(function: Callable[..., None], parameters: list[inspect.Parameter]) -> Callable[..., None]:
-    """A function for which Typer makes an option or argument of each of these parameters."""
+    """Declare the parameters of which Typer makes a command's options and arguments."""
     function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return function
@@ -160,7 +160,7 @@ class BackendOptions:
 class ReportOptions:
     """Options of the commands that write a page on request."""
 
-    report: Path | None = option("Write a page with figures.", metavar="FILE.html")
+    report: Path | None
     figures: Path | None = FIGURES
 
     @property
@@ -169,7 +169,7 @@ class ReportOptions:
         return self.report is not None or self.figures is not None
 
     def refuse(self, *, force: bool) -> None:
-        """Before the work begins: ConfigError if the page is there, DataError if no figure can be drawn."""
+        """Check before the work begins. ConfigError: the page is there already. DataError: no browser draws figures."""
         refuse_existing(self.report, force=force)
         refuse_figures_without_browser(self.figures)
 

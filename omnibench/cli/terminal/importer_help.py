@@ -19,7 +19,7 @@ _OTHERS = "Options"  # heading of options whose class names no group
 
 
 def importer_help(name: str, command: str) -> str:
-    """What ``import FORMAT --help`` prints. UnknownNameError: there is no importer of that name."""
+    """The text of ``import FORMAT --help``. UnknownNameError: there is no importer of that name."""
     entry = importers.entry(name, "import")
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     lines = [f"Usage: {command} {name} SOURCE -o DATASET [--set KEY=VALUE ...]", ""]

@@ -1,4 +1,4 @@
-"""What ``check``, ``inspect``, ``design``, ``slam`` and ``simulate`` print of recordings, and what to type next."""
+"""Terminal output of ``check``, ``inspect``, ``design`` and ``slam``, and the last sentence of ``import``."""
 
 from __future__ import annotations
 
