@@ -84,7 +84,6 @@ def _with_parameters(function: Callable[..., None], parameters: list[inspect.Par
     return function
 
 
-DATASET = argument("Data set folder.", ...)
 DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
 CALIBRATION = argument("Calibration file.", ...)
 WHICH_DATASET = option("Name of the data set, if the config has several.")
@@ -100,7 +99,6 @@ PLUGINS = option(
     metavar="DIR",
     envvar="OMNIBENCH_PLUGINS",
 )
-PLUGIN_FILES = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE")
 
 # Modules that jobs which read a data set share.
 _READING = ("omnibench.check.evidence", "omnibench.robot.compiled_beforehand")

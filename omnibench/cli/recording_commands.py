@@ -62,7 +62,7 @@ def import_(
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
-    plugin_files: list[Path] | None = shared.PLUGIN_FILES,
+    plugin_files: list[Path] | None = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE"),
 ) -> None:
     """Convert recordings into a data set.
 
