@@ -193,8 +193,8 @@ def _of_run(run: int, log: WheelLog, poses: Array, length: float) -> Windows | N
     bent: Complex = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
     path = poses[:, 0] + 1j * poses[:, 1]
     moved: Complex = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
-    turned, runs, times = poses[last, 2] - poses[first, 2], np.full(len(first), run), np.column_stack([begins, ends])
-    return Windows(at[:, -1] - at[:, 0], bent, turned, moved, runs, times)
+    turned, times = poses[last, 2] - poses[first, 2], np.column_stack([begins, ends])
+    return Windows(at[:, -1] - at[:, 0], bent, turned, moved, np.full(len(first), run), times)
 
 
 def _robust(columns: Complex, observed: Complex) -> tuple[Complex, Array]:

@@ -207,8 +207,10 @@ def write_asked_figures(document: Document, folder: Path | None) -> None:
         from omnibench.report.figure_files import write_figures
 
         names = write_figures(document, folder)
-        shown = f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)" if names else ""
-        typer.echo(f"figures: {shown or 'none in the report'}", err=True)
+        if names:
+            typer.echo(f"figures: {folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)", err=True)
+        else:
+            typer.echo("figures: none in the report", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
@@ -259,7 +261,7 @@ class FitCommand(TyperCommand):
             app = typer.Typer(add_completion=False)
             app.command()(_with_parameters(lambda: None, list(_parameters(FitSettings))))
             made: list[Any] = list(typer.main.get_command(app).params)
-            self._choices = tuple(option.name for option in made)
+            self._choices = tuple(parameter.name for parameter in made)
             after = 1 + [parameter.name for parameter in self.params].index("output")
             self.params[after:after] = made
         return super().get_params(ctx)
@@ -283,13 +285,13 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
         if schema is None:
             continue
-        kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
+        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
-        least = least + 1 if kind is int and "exclusiveMinimum" in schema else least
-        names = [f"--{name}"] if kind is bool else []
+        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
+        names = [f"--{name}"] if annotation is bool else []
         made = option(field.description or "", *names, default=field.default, min=least)
-        kind = kind | None if field.default is None else kind
-        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=kind)
+        annotation = annotation | None if field.default is None else annotation
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=annotation)
 
 
 def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:

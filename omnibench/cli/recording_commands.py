@@ -35,8 +35,9 @@ class HelpOfImporters(TyperCommand):
             if (name := given.get("importer")) is not None:
                 from omnibench.cli.terminal.importer_help import importer_help
 
-                lists = [given.get(key) for key in ("plugins", "plugin_files")]
-                shared.load_given_plugins(*(None if each is None else [Path(one) for one in each] for each in lists))
+                folders = [Path(folder) for folder in given.get("plugins") or ()]
+                files = [Path(file) for file in given.get("plugin_files") or ()]
+                shared.load_given_plugins(folders or None, files)
                 typer.echo(importer_help(str(name), ctx.command_path))
                 ctx.exit()
         return super().parse_args(ctx, args)
@@ -171,8 +172,9 @@ def fetch(
     licence = fetched.licence or "the repository states none; ask its authors before you use it"
     if fetched.licence_file is not None:
         licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
-    for line in (f"source: {fetched.source}, in {fetched.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
-        say(line)
+    say(f"source: {fetched.source}, in {fetched.folder}")
+    say(f"licence: {licence}")
+    say(f"cite: {fetched.cite}")
     holds = f"{fetched.folder} holds {fetched.repository}"
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"

@@ -118,14 +118,14 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
     It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
     """
     calibration, drive = run.calibration, run.calibration.robot.drive
-    known = run.uncertainty.intervals if run.uncertainty is not None and intervals else None
+    elements = run.uncertainty.intervals if run.uncertainty is not None and intervals else None
     notes = []
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
         without = f"the design values are kept along {motions}, of which these data say nothing"
-        notes.append(without if known is None else only)
-    if known is not None and (stopped := [*run.untouched, *run.result.at_bounds]):
+        notes.append(without if elements is None else only)
+    if elements is not None and (stopped := [*run.untouched, *run.result.at_bounds]):
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
     deviations = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
     values = [
@@ -133,12 +133,12 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
         for of_row in zip(calibration.matrix, deviations, strict=True)
     ]
     labelled = [("", values)]
-    if known is not None:
+    if elements is not None:
         touched = np.any([np.zeros(len(drive.names)), *(np.abs(each.rates) > _TOUCHED for each in run.kept)], axis=0)
         marks = ["*" if touch else "" for touch in touched]
         bounds = [
             [Cell("", _interval(*each)) for each in zip(*of_row, marks, strict=True)]
-            for of_row in zip(known.low, known.high, strict=True)
+            for of_row in zip(elements.low, elements.high, strict=True)
         ]
         labelled.append(("  95 %", bounds))
     headings: Sequence[str] = [f"wheel {name}" if drive.direct else name for name in drive.names]

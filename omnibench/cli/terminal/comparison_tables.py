@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rich.console import Console
 
 from omnibench.cli.terminal.calibration_tables import how_to_use
@@ -126,7 +128,7 @@ def _cells(result: StudyResult) -> Table:
         figures.append(NOTHING if beside is None else f"{fixed(beside.ratio.value, 2)} {beside.best}")
         verdict = NOTHING if beside is None else beside.ratio.verdict
         rows.append(Row.of(cell.key.robot, cell_words(cell), *figures, verdict))
-    words = ("Robot", "Training → judged", "Least", "Beside the best published", "Verdict")
-    robot, cells, least, published, shown = (Column(title, numeric=False) for title in words)
-    columns = (robot, cells, Column("Design"), least, Column(reference or "Reference"), published, shown)
-    return Table("Mean error of runs that did not train, Eq. (6)", columns, tuple(rows))
+    text = partial(Column, numeric=False)
+    columns = [text("Robot"), text("Training → judged"), Column("Design"), text("Least")]
+    columns += [Column(reference or "Reference"), text("Beside the best published"), text("Verdict")]
+    return Table("Mean error of runs that did not train, Eq. (6)", tuple(columns), tuple(rows))
