@@ -307,26 +307,20 @@ def design(
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.report import design_document
-    from omnibench.report.render import write_document
 
     shared.refuse_figures_without_browser(figures)
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
     shared.load_given_plugins(plugins)
     limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
+    candidates = design_source(source, robot, limits, dataset=dataset, integration=integration)
     chosen = omnibench.design_experiment(
-        design_source(source, robot, limits, dataset=dataset, integration=integration),
-        use=use,
-        per=per,
-        runs=runs,
-        repetitions=repetitions,
-        dataset=dataset,
-        integration=integration,
+        candidates, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
     )
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
-        write_document(design_document(chosen), output / "report.html")
-    shared.write_asked_figures(design_document(chosen), figures)
+    page = shared.ReportOptions(None if output is None else output / "report.html", figures)
+    page.write(lambda: design_document(chosen))
     if as_json:
         return print_json(chosen)
     print_design(make_console(), chosen)
