@@ -23,7 +23,7 @@ from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration, left_out
 from omnibench.robot.kinematics import relative_deviations
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 _NONE = "no interval"
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
@@ -36,7 +36,7 @@ _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is round
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
     """Print a calibration's cost, its proven lower bound and what that means."""
     certificate, proof = certified.certificate, certified.proof
-    kind = "simulated data" if certified.dataset.simulated else "recorded data"
+    kind = kind_of_data(certified.dataset.simulated)
     lines = [f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}"]
     lines.append(f"cost of the calibration      {certificate.cost * (1 + (certificate.shrinking or 0.0)):.9f}")
     if certificate.shrinking is not None:

@@ -20,13 +20,13 @@ from omnibench.report.numbers import NOTHING, fixed
 from omnibench.robot.calibration import read_calibration
 from omnibench.study.report import cell_words
 from omnibench.study.study_result import StudyResult, mean_ratio
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 
 def print_result(console: Console, result: ComparisonResult) -> None:
     """Print the tables of every data set, and the runs without an answer."""
     for view in views(result):
-        kind = "simulated data" if view.dataset.simulated else "recorded data"
+        kind = kind_of_data(view.dataset.simulated)
         console.print(f"{view.name} ({kind}), cost {result.config.objective}", soft_wrap=True)
         tables = [cost_table(view, split) for split in view.splits]
         tables += [final_error_table(view, split) for split in view.splits]
