@@ -16,6 +16,11 @@ def some(names: Sequence[str], most: int = 12) -> str:
     return ", ".join(names[:most]) + more
 
 
+def kind_of_data(simulated: bool) -> str:
+    """The origin of a recording, in the headings of tables."""
+    return "simulated data" if simulated else "recorded data"
+
+
 def noun_for(number: int, noun: str) -> str:
     """The noun alone, for numbers written without groups of digits: ``run``, ``runs``, ``trajectories``."""
     several = f"{noun[:-1]}ies" if noun[-1] == "y" and noun[-2] not in "aeo" else f"{noun}s"

@@ -121,25 +121,25 @@ def check(
 
 
 def check_recording(read: RecordingSource) -> CheckReport:
-    """The check of a recording that was read.
+    """Check a recording that was read.
 
     Where mistakes explain its motion that options mend, other findings are looked for in what was meant.
     """
     evidence = Evidence(read)
     if not read.findings and (otherwise := _read_otherwise(evidence)) is not None:
         return check_recording(otherwise)
-    found = list[Finding]()
-    for find, hidden_by in DETECTORS:
-        if hidden_by & {finding.kind for finding in found if finding.severity == "error"}:
+    others = list[Finding]()
+    for detector, hidden_by in DETECTORS:
+        if hidden_by & {finding.kind for finding in others if finding.severity == "error"}:
             continue
-        findings = [*find(evidence)]
-        by_options = find is misreadings and not read.findings and any(finding.changes for finding in findings)
+        findings = [*detector(evidence)]
+        by_options = detector is misreadings and not read.findings and any(finding.changes for finding in findings)
         if by_options and (mended := read.mended(findings)) is not None:
             return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
-        found += [finding for finding in findings if finding not in read.findings]
+        others += [finding for finding in findings if finding not in read.findings]
     # Each finding of its kind and place once, those of the reading first.
     distinct: dict[tuple[str, str], Finding] = {}
-    for finding in (*read.findings, *found):
+    for finding in (*read.findings, *others):
         distinct.setdefault((finding.kind, finding.where), finding)
     ordered = sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
     findings = read.with_fixes(ordered)
@@ -160,8 +160,8 @@ def check_recording(read: RecordingSource) -> CheckReport:
     else:
         must = "must be mended before a calibration" if verdict == "fix" else "needs more recordings"
         sentence = f"{read.dataset.name} {must}: {(typed or errors or missing)[0].what}"
-        others = len(findings) - 1
-        sentence += f" (and {others} more {noun_for(others, 'finding')})" if others else ""
+        more = len(findings) - 1
+        sentence += f" (and {more} more {noun_for(more, 'finding')})" if more else ""
     return CheckReport(
         verdict=verdict,
         needed=needed,

@@ -282,19 +282,20 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
         if abs(gone) > max(_LEAST_OFF, quantile * clock.drift_error * clock.length):
             drift[run.id] = gone
     kinds: tuple[tuple[Kind, dict[str, float]], ...] = (("clock_offset", offset), ("clock_drift", drift))
-    for kind, off in kinds:
-        if not off:
+    for kind, seconds in kinds:
+        if not seconds:
             continue
-        least, most, every = min(off.values()), max(off.values()), len(off) == count
-        size, among = max(-least, most), "every run" if every else f"{len(off)} of {count} runs"
+        least, most = min(seconds.values()), max(seconds.values())
+        size, every = max(-least, most), len(seconds) == count
+        among = "every run" if every else f"{len(seconds)} of {count} runs"
         if kind == "clock_offset":
-            ways = [f"{seconds:.2f} s too {way}" for way, seconds in (("late", -least), ("early", most)) if seconds > 0]
-            what = f"the stamps of the reference are {'up to ' if len(ways) < 2 else ''}{' to '.join(ways)} in {among}"
+            ways = [f"{off:.2f} s too {way}" for way, off in (("late", -least), ("early", most)) if off > 0]
+            what = f"the stamps of the reference are {' to '.join(ways) if len(ways) > 1 else f'up to {ways[0]}'}"
         else:
-            what = f"the reference's clock goes too {'slow' if size == most else 'fast'}, by up to {size:.2f} s a run"
-            what += f", in {among}"
+            what = f"the reference's clock goes too {'slow' if size == most else 'fast'}, by up to {size:.2f} s a run,"
+        what += f" in {among}"
         severity: Severity = "error" if size > _SPOILS else "warning"
-        where = "the reference" if every else runs_in_words(list(off), count)
+        where = "the reference" if every else runs_in_words(list(seconds), count)
         yield Finding(kind=kind, what=what, where=where, severity=severity, changes={"clocks": "match"})
 
 

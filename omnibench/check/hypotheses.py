@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 from operator import itemgetter
@@ -321,14 +320,17 @@ def _placed(robot: Robot, keys: Sequence[str], factor: float) -> dict[str, dict[
 
 def _corrected(robot: Robot, wheels: Mapping[str, Mapping[str, Any]]) -> Robot | None:
     """The robot with other values of some wheels; None if nothing changes, or it is no robot."""
-    with suppress(ConfigError, np.linalg.LinAlgError):
-        if wheels and np.isfinite((other := corrected_robot(robot, wheels, None)).inverse_kinematic_matrix).all():
-            return other
-    return None
+    if not wheels:
+        return None
+    try:
+        other = corrected_robot(robot, wheels, None)
+        return other if np.isfinite(other.inverse_kinematic_matrix).all() else None
+    except (ConfigError, np.linalg.LinAlgError):
+        return None
 
 
 def _tracked_point(robot: Robot, fit: FreeFit) -> Array:
-    """Where the tracked point is (2,), m, beside where the design has it, by the matrix; NaN if nothing turns.
+    """Offset (2,), m, of the tracked point from its place in the design, by the matrix; NaN if nothing turns.
 
     A point at (x, y) of the robot has rows k1 - y k3 and k2 + x k3.
     """
@@ -469,10 +471,8 @@ def _scaled(names: Sequence[str], group: Array, factor: float) -> Finding:
     where = "all wheels" if group.all() else _members(names, group)
     words = f"the rates of {where} look about {_times_too(factor, 'high', 'low')}"
     if factor in _COUNTS:
-        shown = max(factor, 1 / factor)
-        words += (
-            f", as where counts are {'not ' if factor < 1 else ''}multiplied by {shown:g}, or by a gear of {shown:g}"
-        )
+        count, multiplied = max(factor, 1 / factor), "not multiplied" if factor < 1 else "multiplied"
+        words += f", as where counts are {multiplied} by {count:g}, or by a gear of {count:g}"
     else:
         words += _as_ticks(2 * math.pi * factor) or "; is there a gear between the encoder and the wheel?"
     factors = np.where(group > 0, float(f"{factor:.3g}"), 1.0).tolist()

@@ -312,9 +312,11 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     present = far.contradictions(gram, np.eye(len(gram))[None])[0]
     if present <= _CONTRADICTING / 3:
         return ()
-    linear = [hypothesis for hypothesis in readings.wheel_hypotheses(recording.robot) if hypothesis.reading is None]
-    keys = [[key for mistake in hypothesis.mistakes for key in mistake.changes] for hypothesis in linear]
-    steering = [each for each, changed in zip(linear, keys, strict=True) if "steering" in " ".join(changed)]
+    steering = []
+    for hypothesis in readings.wheel_hypotheses(recording.robot):
+        options = [option for mistake in hypothesis.mistakes for option in mistake.changes]
+        if hypothesis.reading is None and any(option.startswith("steering") for option in options):
+            steering.append(hypothesis)
     shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
     best = int(shares.argmin())
     return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
@@ -341,9 +343,10 @@ def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
 
 @dataclass(frozen=True, eq=False)
 class _Moments:
-    """Some runs, at moments between which the robot turns by a radian: path since the start, turn since the last one.
+    """Runs at S moments, between which the robot turns by a radian.
 
-    odometry: of the logs at these moments. poses, starts (S, 3): of the reference, there and at the begin of the run.
+    odometry: of the logs, at these moments. poses (S, 3): of the reference, at these moments. starts (S, 3): pose of
+    the reference at the begin of each moment's run.
     """
 
     recording: Recorded
@@ -432,11 +435,11 @@ class _Moments:
             return Explained()
         distinct, alike = [values[count:]], list[tuple[Finding, ...]]()
         for point in (other[count:] for other, _, _ in likely):
-            apart = min(np.hypot(*(point - other)) for other in distinct) > _APART * reach
-            distinct += [point] if apart else []
-            if apart and (other := readings.another_mount(robot, point)) is not None:
-                words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
-                alike.append((other.model_copy(update={"what": words}),))
+            if min(np.hypot(*(point - other)) for other in distinct) > _APART * reach:
+                distinct.append(point)
+                if (other := readings.another_mount(robot, point)) is not None:
+                    words = f"{other.what}, which runs that drive ahead and then turn on the spot would tell"
+                    alike.append((other.model_copy(update={"what": words}),))
         return Explained((mistake,), tuple(alike))
 
     def _fitted(self, start: Array, deviation: float, free: int) -> tuple[Array, float, float]:

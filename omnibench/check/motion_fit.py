@@ -193,8 +193,8 @@ def _of_run(run: int, log: WheelLog, poses: Array, length: float) -> Windows | N
     bent: Complex = np.einsum("ws,wsm->wm", np.exp(1j * headings), pieces)
     path = poses[:, 0] + 1j * poses[:, 1]
     moved: Complex = (path[last] - path[first]) * np.exp(-1j * poses[first, 2])
-    turned, runs, times = poses[last, 2] - poses[first, 2], np.full(len(first), run), np.column_stack([begins, ends])
-    return Windows(at[:, -1] - at[:, 0], bent, turned, moved, runs, times)
+    turned, times = poses[last, 2] - poses[first, 2], np.column_stack([begins, ends])
+    return Windows(at[:, -1] - at[:, 0], bent, turned, moved, np.full(len(first), run), times)
 
 
 def _robust(columns: Complex, observed: Complex) -> tuple[Complex, Array]:
@@ -237,10 +237,7 @@ _PLACE = 0.1  # standard deviation of the tracked point's x and y, as a share of
 
 
 def usual_changes(robot: Robot) -> Array:
-    """What a standard deviation of each radius, of each row's gain and of the tracked point's yaw adds to the design.
-
-    (J, 3, M).
-    """
+    """Changes (J, 3, M) of the design by one standard deviation of each radius, row's gain and tracked point's yaw."""
     design = robot.inverse_kinematic_matrix
     columns = design.shape[1]
     lateral = _LATERAL if any(wheel.kind == "mecanum" for wheel in robot.wheels) else _GAINS[1]

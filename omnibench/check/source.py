@@ -103,7 +103,7 @@ class RecordingSource:
                 yield error("wheel_unit", what, "all wheels", {"wheel_quantity": other})
 
     def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
-        """The recording as these findings mend it, which it then has; None if it cannot be read so."""
+        """The recording, read again with the options that mend these findings; None if it cannot be read so."""
         dataset = self.read_by(self.mended_options(findings))
         return None if dataset is None else replace(self, dataset=dataset, findings=tuple(findings))
 
@@ -247,7 +247,7 @@ def _read(name: str, source: Path, given: Mapping[str, Any]) -> Dataset:
 
 
 def _title(source: Path) -> str:
-    """What a source is called: the name of a folder, or of a file without its ending."""
+    """The title of a source: the name of its folder, or of its file without the ending."""
     return source.name if source.is_dir() else source.stem
 
 
@@ -303,11 +303,12 @@ def _changed(read: RecordingSource, options: Mapping[str, Any], key: str, value:
         case "pose_order":  # x and y exchanged are mirrored, and turned by a right angle
             turned = round(float(options.get("heading_offset_deg", 0.0)) - 90, 3)
             return {"pose_signs": _product(options.get("pose_signs"), [1, -1, 1]), "heading_offset_deg": turned}
-        case "wheel_signs" | "pose_signs" | "steering_signs":
-            changed: dict[str, Any] = {key: _product(present, value)}
-            if key == "steering_signs" and (offsets := options.get("steering_offsets_deg")):
-                changed["steering_offsets_deg"] = _product(offsets, value)  # they are added after the signs
-            return changed
+        case "wheel_signs" | "pose_signs":
+            return {key: _product(present, value)}
+        case "steering_signs":  # offsets are added after the signs
+            offsets = options.get("steering_offsets_deg")
+            turned_back = {"steering_offsets_deg": _product(offsets, value)} if offsets else {}
+            return {key: _product(present, value), **turned_back}
         case "steering_factors":
             return {"steering_scale": _one_or_all(_product(options.get("steering_scale"), value))}
         case "steering_offsets_deg":

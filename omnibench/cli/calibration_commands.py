@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 
 calibration_app = typer.Typer()
+_PAGE = shared.report_options("Write a page: before and after, paths, parameters, errors by motion.")
 
 
 @calibration_app.command()
@@ -156,9 +157,7 @@ def calibrate(
     context: typer.Context,
     dataset: list[Path] = shared.DATASETS,
     output: Path | None = output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml"),
-    page: shared.ReportOptions = shared.report_options(
-        "Write a page: before and after, paths, parameters, errors by motion."
-    ),
+    page: shared.ReportOptions = _PAGE,
     jobs: shared.BackendOptions = shared.BackendOptions(),
     settings: list[str] | None = shared.SETTINGS,
     force: bool = shared.FORCE,
@@ -226,9 +225,7 @@ def evaluate(
         "--path",
         metavar="PATH",
     ),
-    page: shared.ReportOptions = shared.report_options(
-        "Write a page: before and after, paths, parameters, errors by motion."
-    ),
+    page: shared.ReportOptions = _PAGE,
     jobs: shared.BackendOptions = shared.BackendOptions(),
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
@@ -339,7 +336,7 @@ def export(
 
 @calibration_app.command()
 def discover(
-    dataset: Path = shared.DATASET,
+    dataset: Path = argument("Data set folder.", ...),
     model: Path | None = option(
         "Start from this calibration. Default: fit a matrix.", "--model", metavar="CALIBRATION"
     ),

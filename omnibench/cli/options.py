@@ -54,16 +54,16 @@ def output_option(text: str, **settings: Any) -> Any:
 
 
 def grouped(function: Callable[..., None]) -> Callable[..., None]:
-    """A command's function, in which a parameter that is by default a group of options stands for all of these.
+    """Decorator of a command, for which a parameter that is a group of options by default adds all of them.
 
-    A group is a dataclass whose fields are options; the function gets one with the values that were given.
+    A group is a dataclass whose fields are options; the command gets one with the values that were given.
     """
     groups, parameters = dict[str, Any](), list[inspect.Parameter]()
     for parameter in inspect.signature(function).parameters.values():
         if not is_dataclass(group := parameter.default):
             parameters.append(parameter)
             continue
-        groups[parameter.name], types = group, get_type_hints(type(group), include_extras=True)
+        groups[parameter.name], types = group, get_type_hints(type(group))
         for field in fields(group):
             default = getattr(group, field.name)
             parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
@@ -78,13 +78,12 @@ def grouped(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _with_parameters(function: Callable[..., None], parameters: list[inspect.Parameter]) -> Callable[..., None]:
-    """A function for which Typer makes an option or argument of each of these parameters."""
+    """Declare the parameters of which Typer makes a command's options and arguments."""
     function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return function
 
 
-DATASET = argument("Data set folder.", ...)
 DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
 CALIBRATION = argument("Calibration file.", ...)
 WHICH_DATASET = option("Name of the data set, if the config has several.")
@@ -100,7 +99,6 @@ PLUGINS = option(
     metavar="DIR",
     envvar="OMNIBENCH_PLUGINS",
 )
-PLUGIN_FILES = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE")
 
 # Modules that jobs which read a data set share.
 _READING = ("omnibench.check.evidence", "omnibench.robot.compiled_beforehand")
@@ -160,7 +158,7 @@ class BackendOptions:
 class ReportOptions:
     """Options of the commands that write a page on request."""
 
-    report: Path | None = option("Write a page with figures.", metavar="FILE.html")
+    report: Path | None
     figures: Path | None = FIGURES
 
     @property
@@ -169,7 +167,7 @@ class ReportOptions:
         return self.report is not None or self.figures is not None
 
     def refuse(self, *, force: bool) -> None:
-        """Before the work begins: ConfigError if the page is there, DataError if no figure can be drawn."""
+        """Check before the work begins. ConfigError: the page is there already. DataError: no browser draws figures."""
         refuse_existing(self.report, force=force)
         refuse_figures_without_browser(self.figures)
 
@@ -209,8 +207,10 @@ def write_asked_figures(document: Document, folder: Path | None) -> None:
         from omnibench.report.figure_files import write_figures
 
         names = write_figures(document, folder)
-        shown = f"{folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)" if names else ""
-        typer.echo(f"figures: {shown or 'none in the report'}", err=True)
+        if names:
+            typer.echo(f"figures: {folder} ({len(names)}, each as SVG and PNG; the first: {names[0]}.svg)", err=True)
+        else:
+            typer.echo("figures: none in the report", err=True)
 
 
 def plugin_folders(given: Sequence[Path] | None) -> list[Path]:
@@ -261,7 +261,7 @@ class FitCommand(TyperCommand):
             app = typer.Typer(add_completion=False)
             app.command()(_with_parameters(lambda: None, list(_parameters(FitSettings))))
             made: list[Any] = list(typer.main.get_command(app).params)
-            self._choices = tuple(option.name for option in made)
+            self._choices = tuple(parameter.name for parameter in made)
             after = 1 + [parameter.name for parameter in self.params].index("output")
             self.params[after:after] = made
         return super().get_params(ctx)
@@ -285,13 +285,13 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
         if schema is None:
             continue
-        kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
+        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
-        least = least + 1 if kind is int and "exclusiveMinimum" in schema else least
-        names = [f"--{name}"] if kind is bool else []
+        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
+        names = [f"--{name}"] if annotation is bool else []
         made = option(field.description or "", *names, default=field.default, min=least)
-        kind = kind | None if field.default is None else kind
-        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=kind)
+        annotation = annotation | None if field.default is None else annotation
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=annotation)
 
 
 def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:

@@ -35,8 +35,9 @@ class HelpOfImporters(TyperCommand):
             if (name := given.get("importer")) is not None:
                 from omnibench.cli.terminal.importer_help import importer_help
 
-                lists = [given.get(key) for key in ("plugins", "plugin_files")]
-                shared.load_given_plugins(*(None if each is None else [Path(one) for one in each] for each in lists))
+                folders = [Path(folder) for folder in given.get("plugins") or ()]
+                files = [Path(file) for file in given.get("plugin_files") or ()]
+                shared.load_given_plugins(folders or None, files)
                 typer.echo(importer_help(str(name), ctx.command_path))
                 ctx.exit()
         return super().parse_args(ctx, args)
@@ -62,7 +63,7 @@ def import_(
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
-    plugin_files: list[Path] | None = shared.PLUGIN_FILES,
+    plugin_files: list[Path] | None = option("One plug-in file to load; may be repeated.", "--plugin", metavar="FILE"),
 ) -> None:
     """Convert recordings into a data set.
 
@@ -171,8 +172,9 @@ def fetch(
     licence = fetched.licence or "the repository states none; ask its authors before you use it"
     if fetched.licence_file is not None:
         licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
-    for line in (f"source: {fetched.source}, in {fetched.folder}", f"licence: {licence}", f"cite: {fetched.cite}"):
-        say(line)
+    say(f"source: {fetched.source}, in {fetched.folder}")
+    say(f"licence: {licence}")
+    say(f"cite: {fetched.cite}")
     holds = f"{fetched.folder} holds {fetched.repository}"
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
@@ -305,26 +307,20 @@ def design(
     from omnibench.config import to_json
     from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.report import design_document
-    from omnibench.report.render import write_document
 
     shared.refuse_figures_without_browser(figures)
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
     shared.load_given_plugins(plugins)
     limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
+    candidates = design_source(source, robot, limits, dataset=dataset, integration=integration)
     chosen = omnibench.design_experiment(
-        design_source(source, robot, limits, dataset=dataset, integration=integration),
-        use=use,
-        per=per,
-        runs=runs,
-        repetitions=repetitions,
-        dataset=dataset,
-        integration=integration,
+        candidates, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
     )
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
-        write_document(design_document(chosen), output / "report.html")
-    shared.write_asked_figures(design_document(chosen), figures)
+    page = shared.ReportOptions(None if output is None else output / "report.html", figures)
+    page.write(lambda: design_document(chosen))
     if as_json:
         return print_json(chosen)
     print_design(make_console(), chosen)

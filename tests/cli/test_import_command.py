@@ -30,6 +30,8 @@ from omnibench.registry import Options, importers
 
 class MineOptions(Options):
     speed: float = Field(0.5, gt=0, description="m/s, of the belt")
+    belts: tuple[str, ...] = Field(default_factory=lambda: ("left", "right"), description="names of the belts")
+    gears: dict[str, int] = Field({"left": 2}, description="of the belts")
 
 @importers.register("mine")
 class Mine(Importer):
@@ -64,6 +66,8 @@ def test_the_help_of_a_plug_in_importer_is_made_of_its_options(command: Command,
     shown = command("import", "mine", "--help", "--plugin", tmp_path / "mine.py").stdout
     assert "Recordings of my own." in shown
     assert "\n  speed  number > 0   default 0.5\n      m/s, of the belt" in shown
+    assert "   default [left,right]\n      names of the belts" in shown
+    assert "\n  gears  {key: value}   default {'left': 2}\n      of the belts" in shown
 
 
 def test_the_help_of_import_says_where_the_options_are(command: Command) -> None:

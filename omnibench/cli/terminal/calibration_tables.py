@@ -23,7 +23,7 @@ from omnibench.report.numbers import noise_in_words
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration, left_out
 from omnibench.robot.kinematics import relative_deviations
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 _NONE = "no interval"
 _SCREEN = 25  # lines that a command prints at most, so that a terminal shows all
@@ -36,7 +36,7 @@ _TOUCHED = 1e-6  # share of a direction of drive signals: a smaller one is round
 def print_certificate(console: Console, certified: CertifiedCalibration) -> None:
     """Print a calibration's cost, its proven lower bound and what that means."""
     certificate, proof = certified.certificate, certified.proof
-    kind = "simulated data" if certified.dataset.simulated else "recorded data"
+    kind = kind_of_data(certified.dataset.simulated)
     lines = [f"{certified.dataset.name} ({kind}), training split, cost {certified.cost_name}"]
     lines.append(f"cost of the calibration      {certificate.cost * (1 + (certificate.shrinking or 0.0)):.9f}")
     if certificate.shrinking is not None:
@@ -118,14 +118,14 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
     It has a column for each drive signal; of more than three it is turned, so that a terminal shows all.
     """
     calibration, drive = run.calibration, run.calibration.robot.drive
-    known = run.uncertainty.intervals if run.uncertainty is not None and intervals else None
+    elements = run.uncertainty.intervals if run.uncertainty is not None and intervals else None
     notes = []
     if run.kept:
         motions = " and ".join(f"{each.words} ({each.motion})" for each in run.kept)
         only = f"* only if the design values are right along {motions}: these data say nothing of it, and they are kept"
         without = f"the design values are kept along {motions}, of which these data say nothing"
-        notes.append(without if known is None else only)
-    if known is not None and (stopped := [*run.untouched, *run.result.at_bounds]):
+        notes.append(without if elements is None else only)
+    if elements is not None and (stopped := [*run.untouched, *run.result.at_bounds]):
         notes.append(f"{_NONE} of what rests on {', '.join(stopped)}, held by the box or on a bound of it")
     deviations = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
     values = [
@@ -133,12 +133,12 @@ def _matrix_table(run: CalibrationRun, intervals: bool) -> Table:
         for of_row in zip(calibration.matrix, deviations, strict=True)
     ]
     labelled = [("", values)]
-    if known is not None:
+    if elements is not None:
         touched = np.any([np.zeros(len(drive.names)), *(np.abs(each.rates) > _TOUCHED for each in run.kept)], axis=0)
         marks = ["*" if touch else "" for touch in touched]
         bounds = [
             [Cell("", _interval(*each)) for each in zip(*of_row, marks, strict=True)]
-            for of_row in zip(known.low, known.high, strict=True)
+            for of_row in zip(elements.low, elements.high, strict=True)
         ]
         labelled.append(("  95 %", bounds))
     headings: Sequence[str] = [f"wheel {name}" if drive.direct else name for name in drive.names]

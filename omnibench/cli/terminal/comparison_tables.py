@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rich.console import Console
 
 from omnibench.cli.terminal.calibration_tables import how_to_use
@@ -18,13 +20,13 @@ from omnibench.report.numbers import NOTHING, fixed
 from omnibench.robot.calibration import read_calibration
 from omnibench.study.report import cell_words
 from omnibench.study.study_result import StudyResult, mean_ratio
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 
 def print_result(console: Console, result: ComparisonResult) -> None:
     """Print the tables of every data set, and the runs without an answer."""
     for view in views(result):
-        kind = "simulated data" if view.dataset.simulated else "recorded data"
+        kind = kind_of_data(view.dataset.simulated)
         console.print(f"{view.name} ({kind}), cost {result.config.objective}", soft_wrap=True)
         tables = [cost_table(view, split) for split in view.splits]
         tables += [final_error_table(view, split) for split in view.splits]
@@ -126,7 +128,7 @@ def _cells(result: StudyResult) -> Table:
         figures.append(NOTHING if beside is None else f"{fixed(beside.ratio.value, 2)} {beside.best}")
         verdict = NOTHING if beside is None else beside.ratio.verdict
         rows.append(Row.of(cell.key.robot, cell_words(cell), *figures, verdict))
-    words = ("Robot", "Training → judged", "Least", "Beside the best published", "Verdict")
-    robot, cells, least, published, shown = (Column(title, numeric=False) for title in words)
-    columns = (robot, cells, Column("Design"), least, Column(reference or "Reference"), published, shown)
-    return Table("Mean error of runs that did not train, Eq. (6)", columns, tuple(rows))
+    text = partial(Column, numeric=False)
+    columns = [text("Robot"), text("Training → judged"), Column("Design"), text("Least")]
+    columns += [Column(reference or "Reference"), text("Beside the best published"), text("Verdict")]
+    return Table("Mean error of runs that did not train, Eq. (6)", tuple(columns), tuple(rows))

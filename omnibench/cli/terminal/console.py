@@ -52,7 +52,7 @@ def make_console(error: bool = False) -> Console:
 
 
 def warn(messages: Iterable[str]) -> None:
-    """A line on standard error for each message; for the first of many that differ by places and numbers alone."""
+    """Print the messages on standard error, of many that differ by places and numbers alone only the first."""
     alike: dict[str, list[str]] = {}
     for message in messages:
         alike.setdefault(re.sub(r"\d[\d.,]*", "#", message.partition(": ")[2] or message), []).append(message)
@@ -69,7 +69,7 @@ def say(text: str) -> None:
 
 
 def print_names(summaries: Mapping[str, str], width: int) -> None:
-    """A line for each name, with its summary, wrapped beside a column of names of so many characters."""
+    """Print names, each with its summary beside it. width: of the column of names, in characters."""
     for name, summary in summaries.items():
         head, hang = f"  {name:{width}}", " " * (width + 2)
         typer.echo(fill(summary, make_console().width, initial_indent=head, subsequent_indent=hang))

@@ -19,7 +19,7 @@ _OTHERS = "Options"  # heading of options whose class names no group
 
 
 def importer_help(name: str, command: str) -> str:
-    """What ``import FORMAT --help`` prints. UnknownNameError: there is no importer of that name."""
+    """The text of ``import FORMAT --help``. UnknownNameError: there is no importer of that name."""
     entry = importers.entry(name, "import")
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     lines = [f"Usage: {command} {name} SOURCE -o DATASET [--set KEY=VALUE ...]", ""]
@@ -64,15 +64,15 @@ def _option(
     key: str, field: FieldInfo, schema: dict[str, Any], definitions: dict[str, Any], width: int
 ) -> Iterator[str]:
     """Key, type and default on a line, and what the option says below."""
-    default = schema.get("default")
+    default = field.get_default(call_default_factory=True)
     shown = f"{default:g}" if isinstance(default, float) else str(default)
     if key == "name":
         ending = "   default: as its folder is called"
     elif field.is_required():
         ending = "   must be given"
-    elif isinstance(default, list) and default:
+    elif isinstance(default, tuple | list) and default:
         ending = f"   default [{','.join(map(str, default))}]"
-    elif default in (None, "", []) or isinstance(default, dict):
+    elif default in (None, "", (), [], {}) or isinstance(default, BaseModel):
         ending = ""
     else:
         ending = f"   default {shown.lower() if isinstance(default, bool) else shown}"

@@ -65,11 +65,13 @@ def node_log(console: Console, warnings_only: bool = False) -> Iterator[logging.
 
 def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
     """Print how much of a recording was played, and how long it took."""
-    sent, delivered = sum(report.sent.values()), "delivery not confirmed, since no omnibench node runs the robot"
-    if report.taken is not None:
+    sent = sum(report.sent.values())
+    if report.taken is None:
+        delivered = "delivery not confirmed, since no omnibench node runs the robot"
+    else:
+        count = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
         again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
-        share = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
-        delivered = f"{share} taken by the node{again}"
+        delivered = f"{count} taken by the node{again}"
     console.print(
         f"{plural(report.sent['joint_states'], 'wheel sample')} and {plural(report.sent['slam_pose'], 'SLAM pose')} "
         f"({'simulated' if simulated else 'recorded'}), {report.data_seconds:.1f} s of the drive in "

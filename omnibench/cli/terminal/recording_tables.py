@@ -1,4 +1,4 @@
-"""What ``check``, ``inspect``, ``design``, ``slam`` and ``simulate`` print of recordings, and what to type next."""
+"""Terminal output of ``check``, ``inspect``, ``design`` and ``slam``, and the last sentence of ``import``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from omnibench.cli.terminal.console import print_ending
 from omnibench.cli.terminal.tables import print_table
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 if TYPE_CHECKING:
     from omnibench.check.check import CheckReport
@@ -25,10 +25,6 @@ _COLOURS = {
     "error": "red", "warning": "yellow", "note": "cyan",
 }  # fmt: skip
 _NEEDED = {True: "a calibration is needed: ", False: "a calibration is hardly needed: ", None: ""}
-
-
-def _kind(simulated: bool) -> str:
-    return "simulated data" if simulated else "recorded data"
 
 
 def print_check(console: Console, checked: CheckReport, next_step: str) -> None:
@@ -82,7 +78,7 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
     from omnibench.report.recording.inspection_report import driven_by, identifiability_table, split_table
 
     described = f"; {inspection.description}" if inspection.description else ""
-    lines = [f"{inspection.dataset}: {_kind(inspection.simulated)}{described}"]
+    lines = [f"{inspection.dataset}: {kind_of_data(inspection.simulated)}{described}"]
     lines += [f"source: {inspection.source}"] if inspection.source else []
     lines += [f"licence: {inspection.licence}"] if inspection.licence else []
     references = [f"{plural(count, 'reference')} of {kind}" for kind, count in inspection.references.items()]
@@ -144,7 +140,7 @@ def print_slam(console: Console, summary: SlamSummary) -> None:
 
     counts = f"{plural(summary.runs, 'run')}, {plural(summary.scans, 'scan')}"
     matched = f"{summary.matched_mean:.1%} of the points matched (worst scan {summary.matched_min:.0%})"
-    console.print(f"{summary.dataset}: {_kind(summary.simulated)}; {counts}, {matched}", soft_wrap=True)
+    console.print(f"{summary.dataset}: {kind_of_data(summary.simulated)}; {counts}, {matched}", soft_wrap=True)
     print_table(console, summary_table(summary))
     if summary.accuracy is not None:
         print_slam_accuracy(console, summary.accuracy)

@@ -14,7 +14,7 @@ from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listing, percent, significant, span, with_unit
 from omnibench.robot.effects.effect import Effect, Stage
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 VERDICTS: Mapping[result.Verdict, str] = {
     "none": "nothing is missing",
@@ -263,7 +263,7 @@ def _millimetres(metres: float) -> str:
 
 def data_in_words(discovery: result.Discovery) -> str:
     """The data in words: ``flower (simulated data): 180 training runs, 4,320 poses``."""
-    kind = "simulated data" if discovery.dataset.simulated else "recorded data"
+    kind = kind_of_data(discovery.dataset.simulated)
     runs = plural(len(discovery.trajectories), "training run")
     return f"{discovery.dataset.name} ({kind}): {runs}, {plural(discovery.poses, 'reference pose')}"
 
