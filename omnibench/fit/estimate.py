@@ -344,7 +344,7 @@ class _Rows:
         for logs, firsts, seen in self._driven(terms):
             odometry = OdometryBatch(logs, self._problem.integration)
             poses = odometry.poses(matrix[None])[0]
-            errors += [np.median(stretch, axis=0) for stretch in np.split(poses - seen, firsts[1:])]
+            errors += list(_medians(poses - seen, firsts))
             if slopes:
                 jacobians.append(_means(odometry.jacobian(matrix).reshape(len(poses), 3, -1), firsts))
         if self._references is not None:
@@ -458,6 +458,15 @@ def _means(values: Array, firsts: NDArray[np.intp]) -> Array:
     return np.asarray(np.add.reduceat(values, firsts, axis=0) / counts)
 
 
+def _medians(values: Array, firsts: NDArray[np.intp]) -> Array:
+    """Medians (S, n) of values (K, n) over stretches that begin at ``firsts``."""
+    counts, medians = np.diff([*firsts, len(values)]), np.empty((len(firsts), values.shape[1]))
+    for count in np.unique(counts).tolist():  # those of one length at once
+        alike = np.flatnonzero(counts == count)
+        medians[alike] = np.median(values[firsts[alike][:, None] + np.arange(count)], axis=1)
+    return medians
+
+
 def _chosen(poses: int, stretches: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices of the poses of a run that are looked at, and of the first of each stretch among these.
 
@@ -474,8 +483,8 @@ def corrected_runs(
     robot: Robot, runs: Sequence[Trajectory], terms: Sequence[Term], sample_period: float
 ) -> tuple[Trajectory, ...]:
     """Runs whose rates are the drive signals (F, M) of a robot with effects on its wheels and steering angles."""
-    made = []
+    design, made = robot.inverse_kinematic_matrix, []
     for run in runs:
-        signals = driven_signals(terms, run.final_log, robot, robot.inverse_kinematic_matrix, sample_period)
+        signals = driven_signals(terms, run.final_log, robot, design, sample_period)
         made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
     return tuple(made)
