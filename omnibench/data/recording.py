@@ -251,7 +251,9 @@ class RunsOptions(Options):
 
     group: ClassVar[str] = "Robot and runs"
 
-    robot: RobotOption = Field(description="--set robot=FILE.yaml, or robot.yaml; import csv --template DIR writes one")
+    robot: RobotOption = Field(
+        description="FILE.yaml; default: robot.yaml in the source or beside it; import csv --template DIR writes one"
+    )
     wheels: dict[str, dict[str, Any]] = Field({}, description="values in place of the file's, as {left: {y: 0.12}}")
     mount: dict[str, float] | None = Field(None, description="tracked point, {x: 0.1, y: 0} (m), yaw (rad) or yaw_deg")
     train: Names = Field((), description="patterns of run names that train")
@@ -317,7 +319,7 @@ class ReferenceOptions(RecordingOptions):
     pose_time_offset: FiniteFloat = Field(0.0, description="s, added to the times of the poses")
     pose_time_drift: Drift = Field(0.0, description="s per s since the first pose, added to the times of the poses")
     clocks: Literal["same", "match"] = Field("same", description="match: find offsets and drifts from wheels and poses")
-    longest_gap: Positive | None = Field(None, description="s; cut a run where wheels or poses are missing for longer")
+    longest_gap: Positive | None = Field(None, description="s; cut runs where data lack for longer; default: by the source")
     jumps: Jumps = Field("keep", description="drop lone poses that jump; cut: and end a run where the reference shifts")
     start_at_rest: bool = Field(False, description="true: a run begins where the robot last stood before it drives")
     cut: Literal["rests", "topic", "windows", "none"] = Field("none", description="where runs end and begin")

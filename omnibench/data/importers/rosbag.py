@@ -119,10 +119,12 @@ class RosbagOptions(SensorOptions):
     steering_joints: Names = Field((), description="in the order of the wheels that steer; default: by the names")
     joint_signs: Signs = Field((), description="another name of wheel_signs")
     use: Literal["auto", "positions", "velocities"] = Field("auto", description="auto: positions, if they are there")
-    pose_topic: str | None = Field(None, min_length=1, description="default: the only poses, but for Odometry and tf")
+    pose_topic: str | None = Field(
+        None, min_length=1, description="default: the only one, or */slam_pose, no odometry or tf"
+    )
     pose_columns: Names = Field((), description="fields of pose_topic: of x, y and heading, or of a geometry pose")
     pose_frames: Names = Field((), description="with a tf pose_topic: frame of the reference, and the tracked one")
-    pose_sigma: tuple[Positive, Positive] | None = Field(None, description="m, deg, for poses of unknown covariance")
+    pose_sigma: tuple[Positive, Positive] | None = Field(None, description="m, deg, where poses have no covariance")
     scan_topic: str | None = Field(None, min_length=1, description="LaserScan; default: the only one, or /scan")
     scans: bool = Field(True, description="false: leave the scans out")
     scanner_mount: Mount | None = Field(None, description="of the scanner, m, rad; default: by /tf_static, else 0")
