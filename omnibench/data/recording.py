@@ -319,7 +319,7 @@ class ReferenceOptions(RecordingOptions):
     pose_time_offset: FiniteFloat = Field(0.0, description="s, added to the times of the poses")
     pose_time_drift: Drift = Field(0.0, description="s per s since the first pose, added to the times of the poses")
     clocks: Literal["same", "match"] = Field("same", description="match: find offsets and drifts from wheels and poses")
-    longest_gap: Positive | None = Field(None, description="s; cut runs where data lack for longer; default: by the source")
+    longest_gap: Positive | None = Field(None, description="s; cut where data lack for longer; default: the source's")
     jumps: Jumps = Field("keep", description="drop lone poses that jump; cut: and end a run where the reference shifts")
     start_at_rest: bool = Field(False, description="true: a run begins where the robot last stood before it drives")
     cut: Literal["rests", "topic", "windows", "none"] = Field("none", description="where runs end and begin")
