@@ -21,6 +21,12 @@ part of its variance has the degrees of freedom (Satterthwaite 1946; Bell and Mc
 
 u_c = (H - H_c)^-1 a, and H_c u_c the rows of U. The second part is exact.
 
+Sessions that drive the same commands say how far sessions differ, but not what the model lacks on these commands, which
+all of them share: with three or more sessions the first part of (2) over sessions and that over commands are summed,
+as covariances by two ways of clustering are (Cameron, Gelbach and Miller, J. Bus. Econ. Stat. 29:238, 2011). What
+single runs scatter is in both. Taking it out once, as they do, may leave no covariance, and it is little beside the
+commands' where three sessions repeat them.
+
 Where leaving a cluster out loses a direction, no other cluster says how far an estimate scatters along it. With the
 data's Hessian D = sum_c H_c in units of which D is 1, these are the directions v of
 
@@ -107,21 +113,28 @@ def depending(slopes: Array, inputs: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Independent draws among Z runs. of_run (Z,): index of each run's cluster. sessions: of all runs together."""
+    """Independent draws among Z runs.
+
+    of_run (Z,): index of each run's cluster. sessions: of all runs together. across: the commands that several of the
+    sessions share, which are draws beside them.
+    """
 
     name: Literal["session", "command", "run"]
     of_run: NDArray[np.intp]
     sessions: int = 1
+    across: Clusters | None = None
 
     @classmethod
     def of(cls, runs: Sequence[Trajectory]) -> Clusters:
-        """What a fit scatters over: sessions, where there are three or more; else as ``units_of``."""
-        sessions = {run.session for run in runs if run.session is not None}
+        """What a fit scatters over: sessions, where there are three or more, and their commands; else ``units_of``."""
+        sessions, units = {run.session for run in runs if run.session is not None}, units_of(runs)
         if len(sessions) < FEWEST_SESSIONS:
-            units = units_of(runs)
             return cls(units.name, units.of_run, max(len(sessions), 1))
         keys = [(run.session is not None, run.session or run.id) for run in runs]
-        return cls("session", _numbers(keys), len(sessions))
+        driven = {(run.session, run.command) for run in runs if run.command is not None}
+        shared = len(driven) > len({command for _, command in driven})
+        across = units if shared and units.name == "command" and units.count > 1 else None
+        return cls("session", _numbers(keys), len(sessions), across)
 
     @property
     def count(self) -> int:
@@ -132,6 +145,8 @@ class Clusters:
     def words(self) -> str:
         """The basis of a jackknife: ``jackknife over 12 commands, of one session alone``."""
         basis = f"jackknife over {plural(self.count, self.name)}" if self.count > 1 else "curvature of a single run"
+        if self.across is not None:
+            return f"{basis} and {plural(self.across.count, self.across.name)}"
         return f"{basis}, of one session alone" if self.sessions == 1 else basis
 
     @property
@@ -178,16 +193,29 @@ def jackknife(
     None: no prior. functions (q, k): their derivatives by the unknowns; None: the unknowns themselves. Directions of
     which neither runs nor prior say anything have no variance. A single cluster has the curvature's covariance.
     """
-    by_cluster, slopes = clusters.sums(information), clusters.sums(scores)
     prior = np.zeros(information.shape[1:]) if prior is None else prior
-    count, data = len(by_cluster), by_cluster.sum(axis=0)
-    roots = roots_of(data + prior)  # H = 1 in these coordinates
-    by_cluster, slopes, own = roots.T @ by_cluster @ roots, slopes @ roots, roots.T @ prior @ roots
-    wanted = roots if functions is None else functions @ roots
-    whole = np.eye(roots.shape[1])
-    of_data = whole - own
-    if count == 1:
+    roots = roots_of(information.sum(axis=0) + prior)  # H = 1 in these coordinates
+    own, wanted = roots.T @ prior @ roots, roots if functions is None else functions @ roots
+    if clusters.count == 1:
         return EstimatedCovariance(wanted @ wanted.T, MANY)
+    covariance, parts = own, list[Array]()
+    for way in filter(None, (clusters, clusters.across)):
+        scatter, freedom = _scatter(roots.T @ way.sums(information) @ roots, way.sums(scores) @ roots, own, wanted)
+        covariance = covariance + scatter
+        parts.append(np.square(np.diag(wanted @ scatter @ wanted.T)) / freedom)
+    whole = wanted @ covariance @ wanted.T
+    of_parts = np.sum(parts, axis=0)
+    freedom = np.where(of_parts > 0, np.square(np.diag(whole)) / np.maximum(of_parts, 1e-300), MANY)
+    return EstimatedCovariance(whole, np.minimum(freedom, MANY))
+
+
+def _scatter(by_cluster: Array, slopes: Array, own: Array, wanted: Array) -> tuple[Array, Array]:
+    """The first part (k, k) of Eq. (2), in units of which H is 1, and its degrees of freedom (q,), Eq. (2a).
+
+    by_cluster (G, k, k), slopes (G, k): H_c and g_c. own (k, k): P. wanted (q, k): derivatives of functions.
+    """
+    count, whole = len(by_cluster), np.eye(len(own))
+    of_data = whole - own
     alone = _carried_by_one(by_cluster, of_data)
     others = whole - alone @ alone.T
     # Along directions that one cluster alone carries, H - H_c may be singular: they are left out of Eq. (1)
@@ -210,10 +238,7 @@ def jackknife(
     squares += np.einsum("qij,qji->q", products, products)
     expected = (single - shared).sum(axis=1)
     freedom = np.where(squares > 0, np.square(expected) / np.maximum(squares, 1e-300), count - 1)
-    shares = np.diag(wanted @ scatter @ wanted.T), np.diag(wanted @ (scatter + own) @ wanted.T)
-    of_scatter = np.clip(shares[0] / np.maximum(shares[1], 1e-300), 1e-9, 1.0)
-    freedom = np.clip(freedom, 1.0, count - 1) / np.square(of_scatter)
-    return EstimatedCovariance(wanted @ (scatter + own) @ wanted.T, np.minimum(freedom, MANY))
+    return scatter, np.clip(freedom, 1.0, count - 1)
 
 
 def _carried_by_one(by_cluster: Array, data: Array) -> Array:

@@ -31,6 +31,32 @@ def test_three_sessions_are_the_clusters() -> None:
     assert found.words == "jackknife over 3 sessions"
 
 
+def test_commands_that_sessions_share_are_clusters_beside_them_and_it_is_said() -> None:
+    found = clusters_of([(session, command) for session in "abc" for command in ("go", "turn")])
+    assert found.across is not None
+    assert (found.across.name, found.across.of_run.tolist()) == ("command", [0, 1, 0, 1, 0, 1])
+    assert found.words == "jackknife over 3 sessions and 2 commands"
+    nested = clusters_of([(session, session + command) for session in "abc" for command in ("go", "go", "turn")])
+    assert nested.across is None
+
+
+@pytest.mark.parametrize("sizes", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)], ids=["sessions", "commands", "both"])
+def test_an_interval_holds_what_sessions_and_commands_shift_alike_in_all_their_runs(sizes: tuple[float, float]) -> None:
+    """The mean of 4 sessions of 6 commands, each driven twice; every session, command and run is off by chance."""
+    rng, keys = np.random.default_rng(1), [(s, c) for s in "abcd" for c in "012345" for _ in range(2)]
+    clusters = clusters_of(keys)
+    of_session, of_command = (
+        np.array([names.index(key[which]) for key in keys]) for which, names in enumerate(("abcd", "012345"))
+    )
+    held = []
+    for _ in range(1000):
+        values = sizes[0] * rng.standard_normal(4)[of_session] + sizes[1] * rng.standard_normal(6)[of_command]
+        values = values + 0.5 * rng.standard_normal(len(keys))
+        scores = (values.mean() - values)[:, None]
+        held.append(abs(values.mean()) <= jackknife(np.ones((len(keys), 1, 1)), scores, clusters).reach[0])
+    assert 0.93 <= np.mean(held) <= 0.99
+
+
 def test_commands_are_the_clusters_where_runs_repeat_some_and_sessions_are_two() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("b", "go"), ("b", None)])
     assert (found.name, found.of_run.tolist()) == ("command", [0, 1, 0, 2])
