@@ -189,7 +189,8 @@ def test_both_ways_to_the_geometry_agree() -> None:
     for one, other in zip(wheels(make_problem(runs)), wheels(by_geometry, "parametric"), strict=True):
         assert one.name == other.name
         assert one.value == pytest.approx(other.value, rel=1e-4)
-        assert one.high - one.low == pytest.approx(other.high - other.low, rel=1e-3)
+        # Degrees of freedom of what is derived are means of those of what either way has fitted
+        assert one.high - one.low == pytest.approx(other.high - other.low, rel=0.1)
 
 
 # Intervals by Student's t, of functions and of ratios: units, coverage, and where there is none.
