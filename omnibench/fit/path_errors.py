@@ -23,8 +23,8 @@ most half of what the places show, as robots that turn on the spot show somethin
 Student's t with n - 1 degrees of freedom.
 
 No factor stands on these regions: of held-out runs of six real robots, on paths of the same and of other kinds, 90 to
-100 % lie in them by place and 92 to 100 % by heading, in the mean of the robots 94.8 and 97.5 %. Five robots would set
-the factor on the sixth's places to 0.95 to 1.11 (tests/studies/region_coverage.py).
+100 % lie in them by place and 92 to 100 % by heading, in the mean of the robots 95.5 and 98.0 %. Five robots would set
+the factor on the sixth's places to 0.89 to 1.02 (tests/studies/region_coverage.py).
 
 The design errs by the same, and by the bias of its end against the calibration's.
 """

@@ -760,15 +760,6 @@ class TestFits:
         with open_backend(BackendChoice(name="dask", workers=2)) as backend:
             yield backend
 
-    def test_resampled_intervals_are_the_same_by_any_backend(self, prepared: Prepared, dask: Backend) -> None:
-        flower = load_dataset(prepared.data)
-        alone, *others = (
-            calibrate(flower, intervals=True, backend=backend).intervals for backend in (None, Processes(2), dask)
-        )
-        for each in others:
-            np.testing.assert_array_equal(each.low, alone.low)
-            np.testing.assert_array_equal(each.high, alone.high)
-
     def test_a_proof_by_jobs_is_the_same_by_any_backend(self, prepared: Prepared, dask: Backend) -> None:
         flower = load_dataset(prepared.data)
         calibration = calibrate(flower).calibration
