@@ -252,7 +252,8 @@ class RunsOptions(Options):
     group: ClassVar[str] = "Robot and runs"
 
     robot: RobotOption = Field(
-        description="FILE.yaml; default: robot.yaml in the source or beside it; import csv --template DIR writes one"
+        description="--set robot=FILE.yaml, or robot.yaml in the source or beside it; import csv --template DIR writes "
+        "one"
     )
     wheels: dict[str, dict[str, Any]] = Field({}, description="values in place of the file's, as {left: {y: 0.12}}")
     mount: dict[str, float] | None = Field(None, description="tracked point, {x: 0.1, y: 0} (m), yaw (rad) or yaw_deg")

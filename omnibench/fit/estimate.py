@@ -483,8 +483,9 @@ def corrected_runs(
     robot: Robot, runs: Sequence[Trajectory], terms: Sequence[Term], sample_period: float
 ) -> tuple[Trajectory, ...]:
     """Runs whose rates are the drive signals (F, M) of a robot with effects on its wheels and steering angles."""
-    design, made = robot.inverse_kinematic_matrix, []
-    for run in runs:
-        signals = driven_signals(terms, run.final_log, robot, design, sample_period)
-        made.append(replace(run, rates=signals, steering=None, drive=None, angles=None))
+    design, made = robot.inverse_kinematic_matrix, list[Trajectory]()
+    for part in together(runs):
+        signals = driven_signals(terms, [run.final_log for run in part], robot, design, sample_period)
+        for run, driven in zip(part, signals, strict=True):
+            made.append(replace(run, rates=driven, steering=None, drive=None, angles=None))
     return tuple(made)

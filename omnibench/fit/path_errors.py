@@ -130,10 +130,8 @@ def _slopes(model: OdometryModel, logs: Sequence[WheelLog], covariance: Array) -
     true = list(logs)
     if terms:
         assert model.sample_period is not None  # there are terms
-        true = []
-        for log in logs:
-            driven = driven_signals(terms, log, robot, model.matrix, model.sample_period)
-            true.append(WheelLog(log.times, driven, log.start, log.stamps))
+        signals = driven_signals(terms, logs, robot, model.matrix, model.sample_period)
+        true = [WheelLog(log.times, driven, log.start, log.stamps) for log, driven in zip(logs, signals, strict=True)]
     columns = [OdometryBatch(true, model.integration).jacobian(model.matrix).reshape(len(logs), 3, -1)]
     plain = replace(model, fade=None)
     deviations = np.sqrt(np.maximum(np.diag(covariance)[model.matrix.size :], 0.0)).tolist()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 from omnibench.errors import DataError, PluginError
 from omnibench.robot.effects.effect import MotionEffect, Need, Term, correction_of
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.robot.odometry import WheelLog
-from omnibench.robot.signals import Signals, needed, signals_of
+from omnibench.robot.odometry import RunSamples, WheelLog
+from omnibench.robot.signals import Signals, needed, signals_of_runs
 
 # Attribute of a log for each need of an effect, and words for it where the log lacks it
 _MISSING: dict[Need, tuple[str, str]] = {
@@ -89,10 +90,20 @@ def corrected_twists(terms: Sequence[Term], signals: Signals, matrix: Array) -> 
     return twists + (true.body if mount is None else true.body @ mount.twist.T), true.world
 
 
-def driven_signals(terms: Sequence[Term], log: WheelLog, robot: Robot, matrix: Array, sample_period: float) -> Array:
-    """The drive signals (F, M) of a log as effects on wheels and steering correct them; sample_period: nominal, s."""
-    true = corrected(terms, signals_of(log, robot, matrix, sample_period, needs_of(terms)))
-    return robot.drive.signals(true.rates, true.steering)
+def driven_signals(
+    terms: Sequence[Term], logs: Sequence[WheelLog], robot: Robot, matrix: Array, sample_period: float
+) -> list[Array]:
+    """The drive signals (F, M) of every log as effects on wheels and steering correct them.
+
+    sample_period: nominal, s. The logs of a session that follow each other are corrected at once.
+    """
+    needs, driven = needs_of(terms), list[Array]()
+    for _, of_session in groupby(logs, key=lambda log: log.session):
+        alike = list(of_session)
+        samples = RunSamples.of([log.times for log in alike])
+        true = corrected(terms, signals_of_runs(alike, samples, robot, matrix, sample_period, needs))
+        driven += np.split(robot.drive.signals(true.rates, true.steering), samples.edges[1:-1])
+    return driven
 
 
 def needs_of(terms: Sequence[Term]) -> frozenset[Need]:

@@ -256,7 +256,7 @@ ROBUST: tuple[LossName, ...] = ("huber", "student_t")
 
 # Simulated sets of which the mean error is compared: one alone is 5 % better or worse by chance.
 DIFF = make_robot("diff", fixed("right", 0, -0.1, radius=0.042), fixed("left", 0, 0.1, radius=0.042))
-SETS = {"least_squares": 16, "map": 3, "closed_form": 3, "crs": 2}
+SETS = {"least_squares": 16, "map": 3, "closed_form": 2, "crs": 2}
 
 
 @cache
