@@ -504,7 +504,7 @@ def flower() -> Dataset:
     return source.load(name)
 
 
-@pytest.mark.parametrize("box", ["paper", "row"])
+@pytest.mark.parametrize("box", ["paper", pytest.param("row", marks=pytest.mark.slow)])
 def test_on_the_papers_flower_closed_form_is_proven_to_a_tenth_of_a_per_cent(flower: Dataset, box: Box) -> None:
     found = calibrate(flower, box=box, integration="euler").calibration
     certified = certify_optimum(found, flower, box=box, seconds=np.inf, parts=2000)
