@@ -165,7 +165,9 @@ OTHERS = [*product(SPARSE, ("skid", *STEERED))]
 OTHERS.remove(("one negated", "car"))  # the rates of both rear wheels make one signal
 
 
-@pytest.mark.parametrize(("change", "robot"), [*product(SPARSE, ("diff",)), *slow_cases(*product(SPARSE, ("mecanum",)), *OTHERS)])
+@pytest.mark.parametrize(
+    ("change", "robot"), [*product(SPARSE, ("diff",)), *slow_cases(*product(SPARSE, ("mecanum",)), *OTHERS)]
+)
 def test_positions_without_headings_tell_a_misread_recording(change: str, robot: str) -> None:
     made, kind = CHANGES.get(change, (lambda run: one(run, -1.0) if change == "one negated" else run, "wheel_negated"))
     runs = [positions_alone(made(run)) for run in recorded(robot).trajectories]
