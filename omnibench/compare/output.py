@@ -13,7 +13,14 @@ import polars as pl
 
 from omnibench import files as disk
 from omnibench.compare.config import CompareConfig, NamedConfig
-from omnibench.compare.result import THEORETICAL_NAME, ComparisonResult, EntryStatistics, RunRecord, ScoredRun
+from omnibench.compare.result import (
+    THEORETICAL_NAME,
+    ComparisonResult,
+    EntryStatistics,
+    RunRecord,
+    ScoredRun,
+    TypicalAnswer,
+)
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
@@ -143,7 +150,8 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
     """The calibration file of a run with an answer."""
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.matrix is not None  # only runs with an answer are written
-    uncertainty = result.uncertainties.get((run.record.dataset, run.record.label))
+    answer = result.typical.get((run.record.dataset, run.record.label)) or TypicalAnswer(None, ())
+    uncertainty = answer.uncertainty
     covariance = covariance_rows(uncertainty.covariance) if uncertainty else None
     extension = run.extension or ModelExtension(effects=(), covariance=covariance)
     of_record = {"calibrator", "options", "seed", "box", "outcome", "reason"}
@@ -162,6 +170,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
         provenance,
         integration=result.config.integration,
         noise=uncertainty.noise if uncertainty else run.noise if run.extension else None,
+        parameters={each.name: each for each in answer.parameters},
         **dict(extension),
     )
 

@@ -199,12 +199,23 @@ class EntryVerdict:
     verdict: HeldOutVerdict
 
 
+@dataclass(frozen=True, eq=False)
+class TypicalAnswer:
+    """The answer of an entry's typical run.
+
+    uncertainty: None where it is no minimum, or is searched in no box. parameters: the physical ones that it means.
+    """
+
+    uncertainty: Uncertainty | None
+    parameters: tuple[PhysicalParameter, ...]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ComparisonResult(Shown):
     """Everything that the report shows.
 
-    design_costs: mean cost of the design values, by data set and split. uncertainties: of the entries' typical runs, by
-    data set and label. held_out: the verdict on the best calibration of each data set that has one. sessions: by data
+    design_costs: mean cost of the design values, by data set and split. typical: of the entries' typical runs, by data
+    set and label. held_out: the verdict on the best calibration of each data set that has one. sessions: by data
     set, sentences on sessions that differ from the others or could not be compared.
     """
 
@@ -215,7 +226,7 @@ class ComparisonResult(Shown):
     statistics: tuple[EntryStatistics, ...]
     design_costs: Mapping[str, Mapping[Split, Interval]]
     certificates: tuple[BoxCertificate, ...]
-    uncertainties: Mapping[tuple[str, str], Uncertainty]
+    typical: Mapping[tuple[str, str], TypicalAnswer]
     held_out: Mapping[str, EntryVerdict]
     environment: Environment
     warnings: tuple[str, ...]

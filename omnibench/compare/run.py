@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,15 @@ from omnibench.compare.execute import PRELOAD, execute, resumable
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, PlannedRun, load_datasets, make_plan
 from omnibench.compare.report.comparison_report import comparison_document
-from omnibench.compare.result import BoxCertificate, ComparisonResult, EntryStatistics, RunRecord, ScoredRun, SplitScore
+from omnibench.compare.result import (
+    BoxCertificate,
+    ComparisonResult,
+    EntryStatistics,
+    RunRecord,
+    ScoredRun,
+    SplitScore,
+    TypicalAnswer,
+)
 from omnibench.compare.statistics import (
     design_costs,
     entry_statistics,
@@ -43,7 +51,7 @@ from omnibench.fit.intervals import UnitName, units_of
 from omnibench.fit.parameterisation import make_bounds
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.fit.span import Treatment, driven_span
-from omnibench.fit.uncertainty import NoCovarianceError, Uncertainty, uncertainty_of
+from omnibench.fit.uncertainty import NoCovarianceError, physical_parameters, uncertainty_of
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import ResultStore
 from omnibench.processes import one_thread_processes
@@ -337,23 +345,27 @@ def _with_proven_gap(
     return done
 
 
-def typical_uncertainties(
+def typical_answers(
     plan: Sequence[PlannedRun],
     results: Sequence[RunResult],
     scored: Sequence[ScoredRun],
     statistics: Sequence[EntryStatistics],
-) -> dict[tuple[str, str], Uncertainty]:
-    """The uncertainty of every entry's typical run, by data set and label; none where its answer is no minimum."""
+) -> dict[tuple[str, str], TypicalAnswer]:
+    """How sure the answer of every entry's typical run is, and what it means, by data set and label."""
     typical = [entry.typical for entry in statistics]
-    uncertainties = {}
+    answers = {}
     for run, result, done in zip(plan, results, scored, strict=True):
-        if run.box_name == UNBOUNDED or not any(done is one for one in typical):
+        if result.vector is None or not any(done is one for one in typical):
             continue
-        try:
-            uncertainties[run.dataset_name, run.label] = uncertainty_of(run.problem(), result)
-        except NoCovarianceError:
-            continue
-    return uncertainties
+        problem, uncertainty = run.problem(), None
+        if run.box_name != UNBOUNDED:
+            with suppress(NoCovarianceError):  # its answer is no minimum
+                uncertainty = uncertainty_of(problem, result)
+        effects = result.extension.effects if result.extension else ()
+        fitted_mount = run.settings.mount == "fit"
+        reading = physical_parameters(problem, result, uncertainty, effects, fitted_mount=fitted_mount)
+        answers[run.dataset_name, run.label] = TypicalAnswer(uncertainty, reading.parameters)
+    return answers
 
 
 def run_comparison(
@@ -395,7 +407,7 @@ def run_comparison(
             scored = score(config, plan, results, datasets)
             runs, certificates = certify(config.certificate, plan, scored)
             statistics = entry_statistics(runs, config.bootstrap)
-            uncertainties = typical_uncertainties(plan, results, runs, statistics)
+            typical = typical_answers(plan, results, runs, statistics)
             result = ComparisonResult(
                 config=config,
                 output=folder,
@@ -404,7 +416,7 @@ def run_comparison(
                 statistics=statistics,
                 design_costs=design_costs(runs, config.bootstrap),
                 certificates=certificates,
-                uncertainties=uncertainties,
+                typical=typical,
                 held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
                 sessions=sessions_that_differ(datasets, config.integration),
                 environment=environment(),

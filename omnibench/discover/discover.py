@@ -47,12 +47,14 @@ from omnibench.environment import package_versions
 from omnibench.errors import DataError, computable, require_type
 from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.fit.path_errors import slip_of
+from omnibench.fit.prior import default_mount
 from omnibench.fit.sessions import SessionComparison
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.progress import Reporter, Stages, no_progress
 from omnibench.registry import costs
 from omnibench.robot.calibration import Calibration, EffectTerm, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
+from omnibench.robot.physical import read_matrix
 
 _Dependences = Sequence[result.CovariateDependence]
 _PLACES = 2  # covariates that a headline names, as what shows in one often shows in another, too (chosen)
@@ -283,15 +285,18 @@ def _calibration_of(
         "outcome": "converged",
         **choices,
     }
+    robot, matrix, covariance = dataset.robot, extended.fit.model.matrix, extended.covariance_of_terms
+    reading = read_matrix(robot, matrix, covariance, effects=terms, fitted_mount=default_mount(robot) == "fit")
     calibration = calibration_of_fit(
         f"{dataset.name} {name}",
         dataset,
-        extended.fit.model.matrix,
+        matrix,
         provenance,
         integration=extended.fit.model.integration,
         effects=terms,
         noise=extended.fit.noise.noise,
-        covariance=covariance_rows(extended.covariance_of_terms),
+        parameters={each.name: each for each in reading.parameters},
+        covariance=covariance_rows(covariance),
         session=extended.fit.runs[0].session,
         driven=tuple(tuple(float(value) for value in motion) for motion in validating.training_domain(extended)),
         plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,

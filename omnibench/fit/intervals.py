@@ -147,7 +147,8 @@ class Clusters:
         basis = f"jackknife over {plural(self.count, self.name)}" if self.count > 1 else "curvature of a single run"
         if self.across is not None:
             return f"{basis} and {plural(self.across.count, self.across.name)}"
-        return f"{basis}, of one session alone" if self.sessions == 1 else basis
+        few = {1: "one session", 2: "two sessions"}.get(self.sessions)  # too few to tell how sessions differ
+        return f"{basis}, of {few} alone" if few else basis
 
     @property
     def method(self) -> Literal["bootstrap", "Student's t", "none"]:

@@ -44,6 +44,7 @@ from omnibench.compare.recording_config import recording_config, suitable_calibr
 from omnibench.compare.run import certify
 from omnibench.config import to_yaml
 from omnibench.errors import DataError, OmnibenchError
+from omnibench.fit.calibrate import calibrate
 from omnibench.fit.evaluate import evaluate
 from omnibench.robot.calibration import read_calibration
 from omnibench.simulate.source import simulate_dataset
@@ -373,6 +374,15 @@ def test_the_calibrations_evaluate_to_the_costs_in_the_summary(results: Path) ->
                 assert errors.heading_mean_rad == pytest.approx(run[f"{split}_heading_rad"], rel=1e-12)
         assert calibration.provenance.training_cost == run["train_cost"]
         assert calibration.provenance.fitted == dataset.fingerprints("train")
+
+
+def test_a_comparison_writes_the_physical_parameters_that_calibrate_does(results: Path) -> None:
+    run = calibrate(compared_once().datasets["flower"], "closed_form", integration="arc")
+    found = read_calibration(results / "calibrations" / "flower-closed_form.yaml").parameters
+    assert set(found) == set(run.calibration.parameters)
+    for name, parameter in run.calibration.parameters.items():
+        assert found[name].value == pytest.approx(parameter.value, rel=1e-6)
+        assert found[name].low == pytest.approx(parameter.low, rel=1e-4)
 
 
 def test_calibrations_of_labels_that_look_alike_do_not_overwrite_each_other(tmp_path: Path) -> None:

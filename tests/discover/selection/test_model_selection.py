@@ -574,6 +574,14 @@ def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, D
     np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
 
 
+def test_the_calibration_file_has_the_physical_parameters(grooved: tuple[Dataset, Truth, Discovery]) -> None:
+    dataset, _, found = grooved
+    for wheel, design in zip("abc", (wheel.radius for wheel in dataset.robot.wheels), strict=True):
+        radius = found.plain.parameters[f"radius_{wheel}"]
+        assert radius.design == design
+        assert radius.low < radius.value < radius.high
+
+
 @pytest.mark.parametrize("make", [left_out, nothing])
 def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Callable[[], Discovery]) -> None:
     found = make()

@@ -60,7 +60,7 @@ def test_an_interval_holds_what_sessions_and_commands_shift_alike_in_all_their_r
 def test_commands_are_the_clusters_where_runs_repeat_some_and_sessions_are_two() -> None:
     found = clusters_of([("a", "go"), ("a", "turn"), ("b", "go"), ("b", None)])
     assert (found.name, found.of_run.tolist()) == ("command", [0, 1, 0, 2])
-    assert found.words == "jackknife over 3 commands"
+    assert found.words == "jackknife over 3 commands, of two sessions alone"
 
 
 def test_runs_are_the_clusters_where_no_command_is_repeated() -> None:
