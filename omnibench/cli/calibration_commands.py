@@ -19,7 +19,6 @@ from omnibench.progress import Progress
 
 if TYPE_CHECKING:
     from omnibench.compare.config import CompareConfig
-    from omnibench.study.config import StudyConfig
 
 
 calibration_app = typer.Typer()
@@ -59,23 +58,15 @@ def compare(
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.compare.report.comparison_report import comparison_document
-    from omnibench.study.config import StudyConfig
-    from omnibench.study.study import is_study, read_study_config
 
     shared.refuse_figures_without_browser(figures)
     asked = shared.plugin_folders(plugins or [])
     given = {"backend": jobs.backend, "workers": jobs.workers, "tls": jobs.tls}
-    chosen: CompareConfig | StudyConfig
-    if len(config) == 1 and config[0].is_file() and is_study(config[0]):
-        chosen = read_study_config(config[0], _named_paths(data))
-    else:
-        chosen = _asked_comparison(config, data, asked)
+    chosen = _asked_comparison(config, data, asked)
     folders = tuple(dict.fromkeys([*chosen.plugins, *(folder.resolve() for folder in asked)]))
     chosen = chosen.model_copy(
         update={"plugins": folders} | {name: value for name, value in given.items() if value is not None}
     )
-    if isinstance(chosen, StudyConfig):
-        return _run_study(chosen, output, figures, force)
     with ProgressDisplay() as watch:
         result = omnibench.run_comparison(chosen, output, watch, force=force)
         if figures is not None:
@@ -86,35 +77,13 @@ def compare(
     for name, entry in result.held_out.items():
         print_verdict(entry.verdict, f"{name}, {entry.label}: ", result.sessions.get(name, ()))
     typer.echo(f"report: {result.output / 'report.html'}")
-    if result.every_search_failed:
-        print_ending(
-            f"every search failed, the first: {result.failures[0]}", "mend what its reason names, and run again"
-        )
-        raise typer.Exit(1)
-    return print_comparison_ending(result)
-
-
-def _run_study(config: "StudyConfig", output: Path | None, figures: Path | None, force: bool) -> None:
-    """Run a study and print its answer. The exit code is 1 if a recording cannot be read, or no method answered."""
-    from omnibench.cli.terminal.comparison_tables import print_study, print_study_ending
-    from omnibench.study.report import study_document
-    from omnibench.study.study import run_study
-
-    with ProgressDisplay() as watch:
-        answer = run_study(config, output, watch, force=force)
-        if figures is not None:
-            watch(Progress("drawing the figures"))
-            shared.write_asked_figures(study_document(answer), figures)
-    warn(answer.warnings)
-    print_study(make_console(), answer)
-    typer.echo(f"report: {answer.output / 'report.html'}")
-    if not print_study_ending(answer):
+    if not print_comparison_ending(result):
         raise typer.Exit(1)
 
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":
     """The config that is given, or one for the data set that is: its folders, or a glob."""
-    from omnibench.compare.recording_config import config_in_words, recording_config
+    from omnibench.compare.config import config_in_words, recording_config
     from omnibench.data.storage import is_glob
 
     first = given[0]

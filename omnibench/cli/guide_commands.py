@@ -106,7 +106,7 @@ _CONFIGS = {
     "design": ("omnibench.design.candidates", "DesignConfig"),
     "live": ("omnibench.live.config", "LiveConfig"),
     "simulate": ("omnibench.simulate.source", "SimulationConfig"),
-    "study": ("omnibench.study.config", "StudyConfig"),
+    "study": ("omnibench.compare.config", "CompareConfig"),
 }
 
 

@@ -1,32 +1,45 @@
-"""The config of a comparison, as its YAML file says it, and as it is once every default is written out."""
+"""The config of a comparison, as its YAML file says it, and as it is once every default is written out.
+
+It names ``datasets``, each of which is judged by its own split, or ``robots``, whose runs are divided into training and
+judged runs by kind of path or session.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
-from omnibench.config import Model, Positive, RelativePath, printable, read_model, validate
-from omnibench.data.dataset import Split
+from omnibench.config import Model, NonNegative, Positive, RelativePath, printable, read_model, validate
+from omnibench.data.dataset import Dataset, Split
+from omnibench.data.splits import Names, training_split
+from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
-from omnibench.fit.calibrator import as_answered, unloadable
+from omnibench.fit.calibrator import Calibrator, as_answered, unloadable
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.intervals import Bootstrap
 from omnibench.fit.loss import LossName
 from omnibench.fit.parameterisation import Box, ParameterisationName
-from omnibench.fit.prior import MountChoice
-from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, FitSettings, objective_in_words
+from omnibench.fit.prior import MountChoice, default_cost
+from omnibench.fit.problem import make_parameterisation
+from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, objective_in_words
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.job import TlsFiles
-from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
+from omnibench.registry import Entry, PluginFailure, calibrators, costs, load_plugins, plugin_text
+from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.source import DatasetSource
 
 LEAST_MEMORY = 256.0  # 10^6 bytes; a worker process has 200 MB before its run begins (measured, RLIMIT_DATA)
+THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
+AS_RECORDED = "as recorded"  # the regime without any change
+
+Label = Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printable)]
 
 
 def with_names(entries: Any, key: str) -> Any:
@@ -36,7 +49,7 @@ def with_names(entries: Any, key: str) -> Any:
     return entries
 
 
-def known_backend(backend: str) -> str:
+def _known_backend(backend: str) -> str:
     """The name of a backend. ValueError: it is none's."""
     if flaw := name_flaw(backend):
         raise ValueError(flaw)
@@ -48,34 +61,151 @@ def _is_squares(loss: object) -> bool:
     return loss == "squares"
 
 
+def _is_empty(entries: object) -> bool:
+    return not entries
+
+
+def _named_cost(cost: Any) -> Any:
+    return {"name": cost} if isinstance(cost, str) else cost
+
+
+NamedCost = Annotated[CostChoice, BeforeValidator(_named_cost, json_schema_input_type=str | CostChoice)]
+
+
+class RecordingSource(Model):
+    """Recordings of one robot: a data set (or a glob, or several), or a folder that an importer reads.
+
+    Paths are relative to the study's ``data``. A data set there that has the robot's name, as ``omnibench fetch`` makes
+    it, is taken where the folder to import is not.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
+
+    path: Names = Field((), description="data set folders, or globs")
+    format: str | None = Field(None, description="an importer, see omnibench list; then path is its source")
+    options: dict[str, Any] = Field({}, description="the importer's")
+
+    def source(self, base: Path, name: str) -> DatasetSource:
+        """The source of the robot called ``name``, with its paths below a folder."""
+        places = [base / place for place in self.path]
+        if self.format is None:
+            return DatasetSource(path=tuple(places))
+        for place in (places[0], base / name):
+            if (place / "dataset.yaml").is_file():
+                return DatasetSource(path=place)
+            if place.exists():
+                break
+        return DatasetSource.model_validate(
+            {"import": {"format": self.format, "source": places[0], "options": self.options}}
+        )
+
+    @model_validator(mode="after")
+    def _place_is_given(self) -> RecordingSource:
+        if not self.path:
+            raise ValueError("path is missing: the folder of the data set or of the recordings, below the study's data")
+        if self.format is not None and len(self.path) > 1:
+            raise ValueError("an importer reads one folder; give one path")
+        return self
+
+
+class TrainingChoice(Model):
+    """Which runs train, and so which judge: all that are not among them.
+
+    by: ``split``, the data set's own; ``kind``, all runs of one kind, and other kinds judge; ``session``, one session
+    of one kind after another, and all other sessions and kinds judge. leave_out: in the place of ``by``, every session
+    (command) of a kind judges what the kind's other ones trained, or each kind what all the others did.
+    """
+
+    by: Literal["split", "kind", "session"] | None = None
+    leave_out: Literal["session", "command", "kind"] | None = None
+    kinds: Names = Field((), description="kinds that train; default: each")
+    runs_per_command: tuple[Annotated[int, Field(gt=0)], ...] = Field(
+        (), description="a learning curve: at most so many runs of each command train, for by: kind"
+    )
+
+    @model_validator(mode="after")
+    def _one_rule(self) -> TrainingChoice:
+        if (self.by is None) == (self.leave_out is None):
+            raise ValueError("give one of by (split, kind, session) and leave_out (session, command, kind)")
+        if self.runs_per_command and self.by != "kind":
+            raise ValueError("runs_per_command is for by: kind")
+        if self.kinds and (self.by == "split" or self.leave_out == "kind"):
+            raise ValueError("kinds are for by: kind, by: session, leave_out: session and leave_out: command")
+        return self
+
+
+Rules = Annotated[
+    tuple[TrainingChoice, ...],
+    BeforeValidator(partial(with_names, key="by"), json_schema_input_type=tuple[str | TrainingChoice, ...]),
+]
+
+
+class RobotChoice(RecordingSource):
+    """A robot: its recordings, the kinds of path in them, and how these are divided.
+
+    kinds: patterns of run ids by the name of the kind; runs of none are left out. Default: all runs are of one kind.
+    """
+
+    kinds: dict[Label, Names] = {}
+    trainings: Rules = Field((), description="default: the study's")
+
+
+class RegimeChoice(Model):
+    """A way in which the training runs are made worse; the runs that judge stay as they were recorded.
+
+    runs_per_command: most that train of each command. noise_position (m), noise_heading_deg: standard deviations of
+    white noise that is added to every pose. outlier_share: of the poses, which are moved by outlier_size (m) in a
+    direction of chance. clock_offset (s): standard deviation over runs of the time by which a reference's stamps are
+    late; clock_drift: of what is added to that per second.
+    """
+
+    runs_per_command: int | None = Field(None, gt=0)
+    noise_position: NonNegative = 0.0
+    noise_heading_deg: NonNegative = 0.0
+    outlier_share: float = Field(0.0, ge=0, lt=1)
+    outlier_size: Positive = 1.0
+    clock_offset: NonNegative = 0.0
+    clock_drift: NonNegative = 0.0
+    trainings: Names = Field(("*",), description="patterns of the trainings' names that it is applied to")
+
+    @property
+    def of_poses(self) -> bool:
+        """True if reference poses are all that it changes."""
+        return self.runs_per_command is None and self != RegimeChoice(trainings=self.trainings)
+
+
 class CalibratorEntry(Model):
-    """One entry of the comparison: a calibrator with its options."""
+    """One entry of the comparison: a calibrator with its options.
+
+    What it leaves open is as the config says. family: what it is counted under in the answer on several robots.
+    trainings, regimes: patterns of those of the robots that it is run on, beside the runs as recorded.
+    """
 
     name: str = Field(description="a calibrator, see omnibench list")
-    label: Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printable)] | None = Field(
-        None, description="what tables call it; default: the name and, if it differs, the box"
-    )
+    label: Label | None = Field(None, description="what tables call it; default: the name and, if it differs, the box")
     options: dict[str, Any] = {}
     parameterisation: ParameterisationName | None = Field(None, description="default: the calibrator's own")
     box: Box | None = Field(None, description="default: the config's box")
     limits: GeometryLimits | None = Field(None, description="limits of the geometry parameterisation; default: its own")
+    cost: NamedCost | None = None
+    loss: LossName | None = None
+    unidentified: Unidentified | None = None
+    mount: MountChoice | None = None
+    tolerance: Positive | None = None
+    family: Literal["ours", "published", "baseline", "other"] = "other"
+    trainings: Names = ("*",)
+    regimes: Names = ("*",)
 
-    def settings(self, common: FitSettings) -> CompleteSettings:
-        """The settings of the entry's fit: those common to a comparison, with its own and its calibrator's."""
-        entry = calibrators.entry(self.name)
-        calibrator = entry.cls
-        assert common.unidentified is not None  # a comparison says it
-        unidentified, mount = as_answered(calibrator, common.unidentified, common.mount)
-        of_entry = {
-            "calibrator": entry.name,
-            "options": self.options,
-            "parameterisation": self.parameterisation or calibrator.parameterisation,
-            "box": self.box or common.box,
-            "limits": self.limits,
-            "unidentified": unidentified,
-            "mount": mount,
-        }
-        return CompleteSettings(**(dict(common) | of_entry))
+    @property
+    def shown(self) -> str:
+        """Its name in tables, where its box and parameterisation are the usual ones."""
+        return self.label or self.name
+
+
+Entries = Annotated[
+    tuple[CalibratorEntry, ...],
+    BeforeValidator(partial(with_names, key="name"), json_schema_input_type=tuple[str | CalibratorEntry, ...]),
+]
 
 
 class CertificateChoice(Model):
@@ -116,19 +246,20 @@ class PublishedResult(Model):
         return printed if printed is not None or costs is None else 1 - costs[1] / costs[0]
 
 
-class NamedConfig(Model):
-    """Name and remarks of a comparison or a study."""
+class CompareConfig(Model):
+    """A comparison: data sets, or robots with their trainings and regimes, x calibrators x seeds."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)
     description: str = ""
     notes: tuple[str, ...] = Field((), description="what a reader of the report must know")
-
-
-class CompareConfig(NamedConfig):
-    """A comparison: data sets x calibrators x seeds, with one cost and one budget for all."""
-
-    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], DatasetSource] = Field(min_length=1)
-    cost: CostChoice = CostChoice()
+    datasets: dict[Annotated[str, Field(min_length=1, max_length=60)], DatasetSource] = Field(
+        {}, description="each judged by its own split"
+    )
+    data: RelativePath = Field(Path(), description="folder of the robots' recordings; relative to the config file")
+    robots: dict[Label, RobotChoice] = Field({}, description="in the place of datasets: judged by kinds of path, too")
+    trainings: Rules = Field((TrainingChoice(by="kind"),), min_length=1, description="of the robots' runs")
+    regimes: dict[Label, RegimeChoice] = Field({}, description="ways in which the robots' training runs are made worse")
+    cost: NamedCost | None = Field(None, description="default: final_pose; of robots, the cost that calibrate takes")
     loss: LossName = Field(
         "squares",
         description="of the cost's pose errors when they are fitted: as each calibrator takes them (squares), or one "
@@ -150,10 +281,12 @@ class CompareConfig(NamedConfig):
     )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
-    calibrators: tuple[CalibratorEntry, ...] = Field(min_length=1)
+    calibrators: Entries = Field((), description="what is compared", exclude_if=_is_empty)
+    methods: Entries = Field((), description="another word for calibrators", exclude_if=_is_empty)
+    reference: Label | None = Field(None, description="the entry that is compared with the best published one")
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, strict=True, description="processes; default: the processors")
-    backend: Annotated[str, AfterValidator(known_backend)] = Field(
+    backend: Annotated[str, AfterValidator(_known_backend)] = Field(
         "processes",
         description="where runs are made: processes, dask, or a scheduler of Dask: tcp://HOST:PORT, tls://...",
     )
@@ -163,28 +296,74 @@ class CompareConfig(NamedConfig):
         None, ge=LEAST_MEMORY, description="memory of each run's process, 10^6 bytes; default: no limit"
     )
     bootstrap: Bootstrap = Bootstrap()
-    certificate: CertificateChoice | None = Field(CertificateChoice(), description="null: prove nothing")
+    certificate: CertificateChoice | None = Field(
+        CertificateChoice(), description="null: prove nothing; of robots nothing is proven"
+    )
     published_results: tuple[PublishedResult, ...] = ()
+
+    @property
+    def entries(self) -> tuple[CalibratorEntry, ...]:
+        """What is compared, under either name."""
+        return (*self.calibrators, *self.methods)
+
+    @property
+    def cost_name(self) -> str:
+        """The name of the cost that data sets are judged by."""
+        return (self.cost or CostChoice()).name
 
     @property
     def objective(self) -> str:
         """The names of the cost and of its loss, if it has a robust one."""
-        return objective_in_words(self.cost, self.loss)
+        return objective_in_words(self.cost or CostChoice(), self.loss)
 
-    def settings(self, entry: CalibratorEntry, seed: int) -> CompleteSettings:
-        """The settings of an entry's fit."""
-        names = ("cost", "loss", "box", "integration", "budget", "unidentified", "tolerance", "mount")
-        return entry.settings(FitSettings(seed=seed, **{name: getattr(self, name) for name in names}))
+    def settings(self, entry: CalibratorEntry, robot: Robot, runs: int, seed: int) -> CompleteSettings:
+        """The settings of an entry's fit to so many runs of a robot."""
+        found = calibrators.entry(entry.name)
+        cost = entry.cost or self.cost
+        if cost is None:
+            cost = CostChoice(name=default_cost(robot, runs)) if self.robots else CostChoice()
+        unidentified, mount = as_answered(found.cls, entry.unidentified or self.unidentified, entry.mount or self.mount)
+        return CompleteSettings(
+            calibrator=found.name,
+            options=entry.options,
+            cost=cost,
+            loss=entry.loss or self.loss,
+            parameterisation=entry.parameterisation or found.cls.parameterisation,
+            box=entry.box or self.box,
+            limits=entry.limits,
+            integration=self.integration,
+            seed=seed,
+            budget=self.budget,
+            unidentified=unidentified,
+            tolerance=entry.tolerance or self.tolerance,
+            mount=mount,
+        )
 
-    @field_validator("calibrators", mode="before", json_schema_input_type=tuple[str | CalibratorEntry, ...])
+    @model_validator(mode="before")
     @classmethod
-    def _names_stand_for_entries(cls, entries: Any) -> Any:
-        return with_names(entries, "name")
+    def _usual_for_robots(cls, given: Any) -> Any:
+        """Robots have many fits, so that each may take less, and nothing is proven of any."""
+        if isinstance(given, Mapping) and given.get("robots"):
+            return {"budget": {"evaluations": 20_000, "seconds": 60.0}, "certificate": None, **given}
+        return given
 
-    @field_validator("cost", mode="before", json_schema_input_type=str | CostChoice)
-    @classmethod
-    def _name_stands_for_cost(cls, cost: Any) -> Any:
-        return {"name": cost} if isinstance(cost, str) else cost
+    @model_validator(mode="after")
+    def _fits_together(self) -> CompareConfig:
+        if bool(self.datasets) == bool(self.robots):
+            raise ValueError("datasets: give datasets, or robots in their place")
+        if not self.entries:
+            raise ValueError("calibrators: name at least one")
+        if self.calibrators and self.methods:
+            raise ValueError("methods: is another word for calibrators; give one of the two")
+        shown = [entry.shown for entry in self.entries]
+        twice = next((name for name in shown if shown.count(name) > 1), None)
+        if self.robots and twice is not None:
+            raise ValueError(f"two methods are called {twice!r}; give one a label of its own")
+        if AS_RECORDED in self.regimes:
+            raise ValueError(f"regimes: {AS_RECORDED!r} is the name of the runs without any change; choose another")
+        if self.reference is not None and self.reference not in shown:
+            raise ValueError(f"reference: no method is called {self.reference!r}; known: {', '.join(shown)}")
+        return self
 
     @field_validator("seeds")
     @classmethod
@@ -204,41 +383,43 @@ def load_calibrators(plugins: Iterable[Path], names: Iterable[str]) -> list[Plug
     failures = load_plugins(plugins)
     missing = set(names) - {entry.name for entry in calibrators.entries()}
     for failure in failures:
-        for name in missing & _names_in(Path(failure.origin)):
+        # A plug-in registers its file's name, or names in its text
+        file = Path(failure.origin)
+        registered = re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", plugin_text(file))
+        for name in missing & {file.stem, *registered}:
             calibrators.register(name)(unloadable(failure))
             missing.remove(name)
     return failures
 
 
-def _names_in(plugin: Path) -> set[str]:
-    """Calibrators that a plug-in file would register: the file's name, and names in its text."""
-    text = plugin_text(plugin)
-    return {plugin.stem, *re.findall(r"""calibrators\s*\.\s*register\(\s*["']([^"']+)["']""", text)}
-
-
 def effective_config(config: CompareConfig) -> CompareConfig:
     """The config with every default of every option written out. Refuses unknown names and options."""
-    cost = effective_cost(config.cost, f"config {config.name}")
-    entries = []
-    for index, entry in enumerate(config.calibrators):
-        place = f"config {config.name}: calibrators.{index}"
-        options = effective_options(entry.name, entry.options, place)
-        entries.append(entry.model_copy(update={"options": options.model_dump(mode="json")}))
-    return config.model_copy(update={"calibrators": tuple(entries), "cost": cost})
+    place = f"config {config.name}"
+    changes: dict[str, Any] = {}
+    if config.cost is not None or config.datasets:
+        changes["cost"] = _effective_cost(config.cost or CostChoice(), place)
+    for key in ("calibrators", "methods"):
+        entries = []
+        for index, entry in enumerate(getattr(config, key)):
+            options = _effective_options(entry, f"{place}: {key}.{index}")
+            cost = entry.cost and _effective_cost(entry.cost, f"{place}: {key}.{index}")
+            entries.append(entry.model_copy(update={"options": options.model_dump(mode="json"), "cost": cost}))
+        changes[key] = tuple(entries)
+    return config.model_copy(update=changes)
 
 
-def effective_cost(choice: CostChoice, place: str) -> CostChoice:
+def _effective_cost(choice: CostChoice, place: str) -> CostChoice:
     """A cost with every default of its options. Errors begin with ``place``: an unknown name or option."""
     options = costs.create(choice.name, choice.options, place).options
     return choice.model_copy(update={"options": options.model_dump(mode="json")})
 
 
-def effective_options(name: str, given: Mapping[str, Any], place: str) -> BaseModel:
-    """The options of a calibrator with every default. ConfigError begins with ``place``: an unknown name or option."""
-    calibrator = calibrators.entry(name, place)
-    options = validate(calibrator.options, given, f"{place}: calibrator {name!r}")
+def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
+    """An entry's options with every default. ConfigError begins with ``place``: an unknown name or option."""
+    calibrator = calibrators.entry(entry.name, place)
+    options = validate(calibrator.options, entry.options, f"{place}: calibrator {entry.name!r}")
     try:
-        calibrators.create(name, given)  # a constructor may check its options further
+        calibrators.create(entry.name, entry.options)  # a constructor may check its options further
     except PluginError:
         pass  # reported as the outcome of its run
     except OmnibenchError as error:
@@ -249,12 +430,28 @@ def effective_options(name: str, given: Mapping[str, Any], place: str) -> BaseMo
 def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None) -> CompareConfig:
     """Read a config; paths in it are relative to its folder and come back absolute.
 
-    ``data`` replaces the sources of data sets by name; the name "" stands for the only one. ConfigError in one line.
+    data: sources of data sets by name, in the place of the config's, the name "" standing for the only one; of robots
+    the folder of all under the name "", and that of one under its name. ConfigError in one line.
     """
-    path = Path(path)
+    path, places = Path(path), dict(data or {})
     config = read_model(CompareConfig, path)
+    if config.robots:
+        base = places.pop("", config.data).resolve()
+        robots = dict(config.robots)
+        for name, place in places.items():
+            if name not in robots:
+                raise UnknownNameError("robot", name, robots, f"--data of {path}")
+            robots[name] = robots[name].model_copy(update={"path": (str(place.resolve()),)})
+        if not base.is_dir() and not all(
+            Path(given).is_absolute() for robot in robots.values() for given in robot.path
+        ):
+            raise ConfigError(
+                f"{path}: the recordings are not at {base}; say where they are with --data DIR (omnibench guide data "
+                "says where the public ones come from)"
+            )
+        return config.model_copy(update={"data": base, "robots": robots})
     sources = dict(config.datasets)
-    for name, location in (data or {}).items():
+    for name, location in places.items():
         if not name and len(sources) > 1:
             raise ConfigError(f"--data: {path} has several data sets; say which: --data NAME={location}")
         name = name or next(iter(sources))
@@ -262,3 +459,62 @@ def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None
             raise UnknownNameError("data set", name, sources, str(path))
         sources[name] = sources[name].at(location.resolve())
     return config.model_copy(update={"datasets": sources})
+
+
+_QUICK_EVALUATIONS, _QUICK_SECONDS = (
+    10_000,
+    30.0,
+)  # of each run; s; chosen: on two cores a first look takes a minute or two
+_LONGEST_NAME = 60  # letters, of a config's name
+
+
+def recording_config(places: Path | Sequence[Path], plugins: Sequence[Path] = ()) -> CompareConfig:
+    """A quick comparison on a data set, with cost and treatment of what is hardly driven as ``calibrate`` has.
+
+    places: its folder, or several, named one by one or by a glob. plugins: folders of plug-ins, whose calibrators
+    take part. DataError: the data set cannot be read, or has no run to train. PluginError: a folder of plug-ins is not
+    there.
+    """
+    folders = dataset_folders(places)
+    dataset = load_dataset(folders)
+    load_plugins(plugins)
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", dataset.name).strip("_.-")[:_LONGEST_NAME] or "dataset"
+    paths = [str(folder.resolve()) for folder in folders]
+    content: dict[str, Any] = {
+        "name": name,
+        "datasets": {name: {"path": paths if len(paths) > 1 else paths[0]}},
+        "cost": default_cost(dataset.robot, len(training_split(dataset))),
+        "budget": {"evaluations": _QUICK_EVALUATIONS, "seconds": _QUICK_SECONDS},
+        "calibrators": suitable_calibrators(dataset),
+        "plugins": [str(path.resolve()) for path in plugins],
+    }
+    return validate(CompareConfig, content, f"comparison on {in_few_words(folders)}")
+
+
+def suitable_calibrators(dataset: Dataset) -> list[str]:
+    """Names of the registered calibrators that can fit a data set's robot, the design values first.
+
+    A matrix that is not fitted, such as a published one, is another robot's and is left out.
+    """
+    entries = [entry for entry in calibrators.entries() if _suits(entry, dataset)]
+    return [THEORETICAL_NAME, *(entry.name for entry in entries if entry.name != THEORETICAL_NAME)]
+
+
+def config_in_words(config: CompareConfig) -> str:
+    """What such a comparison runs, in a sentence."""
+    names = ", ".join(entry.name for entry in config.entries)
+    return (
+        f"no config is given: {names}; cost {config.objective}, at most {config.budget.evaluations:,} evaluations and "
+        f"{config.budget.seconds:g} s each, one seed (config.yaml beside the results says all of it)"
+    )
+
+
+def _suits(entry: Entry[Calibrator], dataset: Dataset) -> bool:
+    calibrator = entry.cls
+    if not calibrator.fitted or not calibrators.create(entry.name).applies(dataset.robot):
+        return False
+    try:
+        make_parameterisation(calibrator.parameterisation, dataset.robot, training_split(dataset))
+    except ConfigError:  # this robot has no such parameters
+        return False
+    return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, fields
@@ -12,13 +13,14 @@ from typing import Any, get_type_hints
 import polars as pl
 
 from omnibench import files as disk
-from omnibench.compare.config import CompareConfig, NamedConfig
+from omnibench.compare.config import THEORETICAL_NAME, CompareConfig
 from omnibench.compare.result import (
-    THEORETICAL_NAME,
+    Cell,
     ComparisonResult,
     EntryStatistics,
+    MethodInCell,
     RunRecord,
-    ScoredRun,
+    ScoredFit,
     TypicalAnswer,
 )
 from omnibench.config import read_yaml, to_json, to_yaml
@@ -32,36 +34,41 @@ from omnibench.robot.calibration import Calibration, ModelExtension, Row, covari
 _MARK = "# The effective config of a {}; the results beside it were made with it."
 
 
-def check_output(folder: Path | None, config: NamedConfig, noun: str = "comparison", *, force: bool = False) -> None:
-    """Check the folder of results of a comparison or study (noun) before the work.
+def _noun(config: CompareConfig) -> str:
+    return "study" if config.robots else "comparison"
+
+
+def check_output(folder: Path | None, config: CompareConfig, *, force: bool = False) -> None:
+    """Check the folder of results before the work.
 
     DataError: it is a file, or it holds anything but an earlier one of the same name, and not ``force``.
     """
     if folder is None:
         return
+    noun = _noun(config)
     disk.check_results_folder(folder, _MARK.format(noun), noun, force=force)
     if force or not (folder / "config.yaml").is_file():
         return
     earlier = read_yaml(folder / "config.yaml")
-    name, others = earlier.get("name"), earlier.get("datasets", {})
+    name, others = earlier.get("name"), earlier.get("datasets") or {}
     if name != config.name:
         raise DataError(f"{folder}: holds the {noun} {name!r}; name another folder for {config.name!r}, or --force")
-    if isinstance(config, CompareConfig) and not set(others) & set(config.datasets):
+    if config.datasets and not set(others) & set(config.datasets):
         raise DataError(
             f"{folder}: holds a comparison on {', '.join(map(repr, others))}; name another folder for "
             f"{', '.join(map(repr, config.datasets))}, or --force"
         )
 
 
-def prepare_output(config: NamedConfig, folder: Path | None, noun: str = "comparison", *, force: bool = False) -> Path:
+def prepare_output(config: CompareConfig, folder: Path | None, *, force: bool = False) -> Path:
     """The folder to write to, with the effective config in it.
 
     Default: ``results/<config name>/<time>``, with a link ``latest``. DataError when it cannot be written to, or as
     ``check_output`` does.
     """
-    check_output(folder, config, noun, force=force)
+    check_output(folder, config, force=force)
     chosen = folder or disk.new_results_folder(disk.RESULTS / config.name)
-    disk.write_text(chosen / "config.yaml", f"{_MARK.format(noun)}\n{to_yaml(config)}")
+    disk.write_text(chosen / "config.yaml", f"{_MARK.format(_noun(config))}\n{to_yaml(config)}")
     if folder is None:
         disk.link_latest(chosen)
     return chosen
@@ -119,13 +126,46 @@ def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> list
 
 def summary(result: ComparisonResult) -> dict[str, Any]:
     """The content of summary.json."""
+    return {
+        "name": result.config.name,
+        **(_of_robots(result) if result.config.robots else _of_datasets(result)),
+        "warnings": list(result.warnings),
+        "environment": result.environment.model_dump(),
+    }
+
+
+def _of_robots(result: ComparisonResult) -> dict[str, Any]:
+    return {
+        "robots": {
+            name: {"runs": len(dataset.trajectories), "simulated": dataset.simulated}
+            for name, dataset in result.datasets.items()
+        },
+        "broken": dict(result.broken),
+        "reference": result.config.reference,
+        "geometric_mean": result.geometric_mean,
+        "against_best": [
+            {name: getattr(each.cell.key, name) for name in ("robot", "training", "judged")}
+            | {
+                "best": each.best,
+                "ratio": each.ratio.value,
+                "low": each.ratio.in_family.low,
+                "high": each.ratio.in_family.high,
+                "unit": each.ratio.unit,
+                "verdict": each.ratio.verdict,
+            }
+            for each in result.against_best
+        ],
+        "failures": list(result.failures),
+    }
+
+
+def _of_datasets(result: ComparisonResult) -> dict[str, Any]:
     # The units and the method of the intervals of each data set and split
     designs = {run.record.dataset: run.design for run in result.runs}
     return {
-        "name": result.config.name,
         "dataset": ", ".join(result.datasets),
         "simulated": {name: dataset.simulated for name, dataset in result.datasets.items()},
-        "cost": result.config.cost.name,
+        "cost": result.config.cost_name,
         **({} if result.config.loss == "squares" else {"loss": result.config.loss}),
         "integration": result.config.integration,
         "budget": result.config.budget.model_dump(),
@@ -141,22 +181,20 @@ def summary(result: ComparisonResult) -> dict[str, Any]:
         "held_out": {name: {"label": each.label} | each.verdict.model_dump() for name, each in result.held_out.items()},
         "sessions": {name: list(sentences) for name, sentences in result.sessions.items()},
         "certificates": [certificate.model_dump() for certificate in result.certificates],
-        "warnings": list(result.warnings),
-        "environment": result.environment.model_dump(),
     }
 
 
-def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
+def calibration_of(run: ScoredFit, result: ComparisonResult) -> Calibration:
     """The calibration file of a run with an answer."""
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.matrix is not None  # only runs with an answer are written
     answer = result.typical.get((run.record.dataset, run.record.label)) or TypicalAnswer(None, ())
     uncertainty = answer.uncertainty
     covariance = covariance_rows(uncertainty.covariance) if uncertainty else None
-    extension = run.extension or ModelExtension(effects=(), covariance=covariance)
+    extension = run.result.extension or ModelExtension(effects=(), covariance=covariance)
     of_record = {"calibrator", "options", "seed", "box", "outcome", "reason"}
     provenance = run.record.model_dump(include=of_record) | {
-        "cost": result.config.cost.name,
+        "cost": run.fit.settings.cost.name,
         "loss": None if result.config.loss == "squares" else result.config.loss,
         "on_bounds": run.record.at_bounds,
         "versions": result.environment.versions,
@@ -169,7 +207,7 @@ def calibration_of(run: ScoredRun, result: ComparisonResult) -> Calibration:
         run.matrix,
         provenance,
         integration=result.config.integration,
-        noise=uncertainty.noise if uncertainty else run.noise if run.extension else None,
+        noise=uncertainty.noise if uncertainty else run.result.noise if run.result.extension else None,
         parameters={each.name: each for each in answer.parameters},
         **dict(extension),
     )
@@ -194,18 +232,64 @@ _COLUMN_OF: dict[Any, Any] = {
 _INTERVAL_COLUMNS = {name: _COLUMN_OF[Interval | None] for split in SPLITS for name in (split, f"{split}_improvement")}
 
 
+_CELL_COLUMNS: dict[str, Any] = {
+    "robot": pl.String, "training": pl.String, "regime": pl.String, "judged": pl.String, "fitted": pl.Boolean,
+    "simulated": pl.Boolean, "method": pl.String, "family": pl.String, "status": pl.String, "reason": pl.String,
+    "fits": pl.Int64, "answers": pl.Int64, "runs": pl.Int64, "sessions": pl.Int64, "cost": pl.Float64,
+    "position_m": pl.Float64, "heading_deg": pl.Float64, "design_cost": pl.Float64, "design_position_m": pl.Float64,
+    "design_heading_deg": pl.Float64, "ratio": pl.Float64, "low": pl.Float64, "high": pl.Float64,
+    "family_low": pl.Float64, "family_high": pl.Float64, "unit": pl.String, "units": pl.String, "seconds": pl.Float64,
+    "numbers": pl.String,
+    "cost_name": pl.String, "unidentified": pl.String, "matrix": pl.List(pl.Float64),
+}  # fmt: skip
+
+
 def result_table(result: ComparisonResult, name: str) -> pl.DataFrame:
-    """One of the tables that are written beside the report: statistics, runs, errors or history."""
+    """One of the tables beside the report: study; of data sets also statistics, runs, errors and history."""
     return _tables(result)[name]
+
+
+def cell_table(result: ComparisonResult) -> pl.DataFrame:
+    """A row for each cell and method, those without an answer among them. Ratios are to the design values, Eq. (6)."""
+    rows = [_cell_row(result, cell, method) for cell in result.cells for method in cell.methods.values()] + [
+        dict.fromkeys(_CELL_COLUMNS) | {"robot": name, "status": "recordings cannot be read", "reason": reason}
+        for name, reason in result.broken.items()
+    ]
+    return pl.DataFrame(rows, _CELL_COLUMNS, orient="row")
+
+
+def _cell_row(result: ComparisonResult, cell: Cell, method: MethodInCell) -> dict[str, Any]:
+    key = cell.key
+    ratio = cell.against_design(method.method, len(result.judged_cells))
+    heading = method.mean("heading")
+    return {
+        "robot": key.robot, "training": key.training, "regime": key.regime, "judged": key.judged, "fitted": key.fitted,
+        "simulated": result.datasets[key.robot].simulated, "method": method.method, "family": method.family,
+        "status": method.status, "reason": method.reason, "fits": method.fits, "answers": method.answers,
+        "runs": len(set(cell.pairs.runs.tolist())), "sessions": cell.pairs.sessions, "cost": method.mean("cost"),
+        "position_m": method.mean("position"), "heading_deg": None if heading is None else math.degrees(heading),
+        "design_cost": float(cell.design["cost"].mean()),
+        "design_position_m": float(cell.design["position"].mean()),
+        "design_heading_deg": math.degrees(float(cell.design["heading"].mean())),
+        "ratio": ratio and ratio.value, "low": ratio and ratio.alone.low, "high": ratio and ratio.alone.high,
+        "family_low": ratio and ratio.in_family.low, "family_high": ratio and ratio.in_family.high,
+        "unit": ratio and ratio.unit, "units": ratio and ratio.units,
+        "seconds": method.seconds if result.config.timing else None,
+        "numbers": method.numbers, "cost_name": method.cost, "unidentified": method.unidentified,
+        "matrix": None if method.matrix is None else method.matrix.ravel().tolist(),
+    }  # fmt: skip
 
 
 def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
     statistics = [_statistics_row(entry) for entry in result.statistics]
+    if result.config.robots:
+        return {"study": cell_table(result)}
     return {
         "runs": _table([_run_row(run) for run in result.runs], RunRecord),
         "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS, orient="row"),
         "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS, orient="row"),
         "statistics": _table(statistics, EntryStatistics, _INTERVAL_COLUMNS),
+        "study": cell_table(result),
     }
 
 
@@ -217,7 +301,7 @@ def _table(rows: list[dict[str, Any]], kind: type, further: Mapping[str, Any] | 
     return pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
 
 
-def _run_row(run: ScoredRun) -> dict[str, Any]:
+def _run_row(run: ScoredFit) -> dict[str, Any]:
     row = run.record.model_dump(mode="json")
     for name in ("options", "parameters"):  # nested values of no fixed shape
         row[name] = json.dumps(row[name])
@@ -252,12 +336,12 @@ def _error_rows(result: ComparisonResult) -> Iterator[tuple[Any, ...]]:
                 yield (*_key(run), split, trajectory.id, trajectory.command, *error, cost)
 
 
-def _history_rows(runs: Iterable[ScoredRun]) -> Iterator[tuple[Any, ...]]:
+def _history_rows(runs: Iterable[ScoredFit]) -> Iterator[tuple[Any, ...]]:
     """Rows of _HISTORY_COLUMNS."""
     for run in runs:
-        for step in run.history:
+        for step in run.result.history:
             yield (*_key(run), step.evaluations, step.seconds, step.cost)
 
 
-def _key(run: ScoredRun) -> tuple[str, str, int]:
+def _key(run: ScoredFit) -> tuple[str, str, int]:
     return run.record.dataset, run.record.label, run.record.seed

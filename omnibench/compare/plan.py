@@ -1,28 +1,44 @@
-"""The data sets of a comparison, its runs (data sets x calibrators x seeds), and each run's problem and key."""
+"""The fits of a comparison: robots x trainings x regimes x folds x entries x seeds; each one's problem and key.
+
+A training divides a robot's runs: which train, fold by fold, and which judge. A data set has one, its own split.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Protocol
 
-from omnibench.compare.config import CompareConfig
-from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.splits import training_split
-from omnibench.errors import ConfigError
+import numpy as np
+
+from omnibench.compare.config import (
+    AS_RECORDED,
+    CalibratorEntry,
+    CompareConfig,
+    RegimeChoice,
+    RobotChoice,
+    TrainingChoice,
+)
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory
+from omnibench.data.splits import repetitions, training_split
+from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError, nearest
+from omnibench.fit.calibrator import refusal_of
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.parameterisation import Box, ParameterisationName
 from omnibench.fit.problem import CalibrationProblem, make_parameterisation, make_problem
 from omnibench.fit.settings import CompleteSettings
 from omnibench.jobs.job import code_digest, content_key
-from omnibench.progress import Reporter, no_progress
+from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
-from omnibench.robot.kinematics import Robot
+from omnibench.robot.kinematics import Array, Robot, interpolated
+from omnibench.words import plural
 
 _PACKAGE = Path(__file__).parents[1]
 # Files that every run depends on; ** takes in subfolders.
@@ -39,8 +55,8 @@ _CALIBRATORS = "fit/calibrators/*.py"
 _NO_PART = "check/*.py"  # judges recordings before they are fitted
 
 
-def run_key(settings: CompleteSettings, dataset: Dataset) -> str:
-    """The key of one run on one data set: it changes with all that the result depends on.
+def fit_key(settings: CompleteSettings, dataset: Dataset) -> str:
+    """The key of one fit to one data set: it changes with all that the result depends on.
 
     The code behind a run is what all runs share (``robot/``, ``fit/``, trajectories, the problem that a run is given)
     and the files of the calibrators and the cost that it names. Files in ``fit/calibrators/`` that it does not name are
@@ -104,20 +120,9 @@ class SearchSpace:
     bounded: bool
 
 
-class RunConfig(Protocol):
-    """The part of a comparison's or a study's config that says how runs are made."""
-
-    @property
-    def plugins(self) -> tuple[Path, ...]: ...
-    @property
-    def timing(self) -> bool: ...
-    @property
-    def memory_mb(self) -> float | None: ...
-
-
 @dataclass(frozen=True)
-class RunTask:
-    """The part of a run that its worker process is sent: the training data, and nothing of the validation data.
+class FitTask:
+    """The part of a fit that its worker process is sent: the training data, and nothing of the validation data.
 
     plugins: folders of plug-ins to load first. timing: True if the machine's speed is to be measured beside the run.
     """
@@ -129,27 +134,280 @@ class RunTask:
     timing: bool
 
 
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run: an entry of the config on one data set with one seed.
+def in_regime(runs: Sequence[Trajectory], regime: RegimeChoice, seed: int) -> tuple[Trajectory, ...]:
+    """The training runs under a regime. Chance hangs on the seed and each run's content alone.
 
-    config: where the run's plug-ins, timing and memory are from. training: the data set's training runs, the same
-    object for all runs on it. settings: of the fit; a geometry does not use their box. box_name: the name of the bounds
-    that are searched, or ``UNBOUNDED``.
+    Runs without poses are only reduced in number. The first pose of a run is noisy, too, but stays at t = 0.
+    """
+    kept = runs
+    if regime.runs_per_command is not None:
+        numbers = repetitions([run.command or run.id for run in runs])
+        kept = [run for run, number in zip(runs, numbers, strict=True) if number <= regime.runs_per_command]
+    return tuple(_worsened(run, regime, seed) if run.has_poses else run for run in kept)
+
+
+def _worsened(run: Trajectory, regime: RegimeChoice, seed: int) -> Trajectory:
+    poses = _late(run, regime, _chance(run, seed, "clock"))
+    rng = _chance(run, seed, "noise")
+    deviations = [regime.noise_position, regime.noise_position, math.radians(regime.noise_heading_deg)]
+    if any(deviations):
+        poses = poses + rng.normal(0.0, deviations, poses.shape)
+    if regime.outlier_share:
+        rng = _chance(run, seed, "outliers")
+        far = rng.random(len(poses)) < regime.outlier_share
+        directions = rng.uniform(0.0, 2 * math.pi, len(poses))
+        away = regime.outlier_size * np.column_stack([np.cos(directions), np.sin(directions)])
+        poses = poses + np.where(far[:, None], np.column_stack([away, np.zeros(len(poses))]), 0.0)
+    return run if poses is run.poses else replace(run, poses=poses)
+
+
+def _late(run: Trajectory, regime: RegimeChoice, rng: np.random.Generator) -> Array:
+    """Poses (K, 3) whose stamps t are late: each was taken at t - (offset + drift t)."""
+    if not (regime.clock_offset or regime.clock_drift):
+        return run.poses
+    offset, drift = rng.normal(0.0, [regime.clock_offset, regime.clock_drift])
+    taken = np.clip(run.pose_times - offset - drift * run.pose_times, 0.0, run.pose_times[-1])
+    return interpolated(taken, run.pose_times, run.poses)
+
+
+def _chance(run: Trajectory, seed: int, what: str) -> np.random.Generator:
+    digest = hashlib.sha256(f"{run.fingerprint} {what}".encode()).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
+
+
+OWN_SPLIT = "own split"  # the training by the data set's own split
+ONE_KIND = "all paths"  # the kind of every run, where the config names none
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """One training set. training: its runs. judged: by kind, the indices of the data set's runs that judge it.
+
+    session: of the training runs, where they are of one. fitted: the kind of the training runs, whose own errors are
+    training errors.
     """
 
-    config: RunConfig
-    dataset_name: str
-    dataset: Dataset
+    name: str
     training: tuple[Trajectory, ...]
+    judged: Mapping[str, tuple[int, ...]]
+    session: str | None = None
+    fitted: Mapping[str, tuple[int, ...]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """A rule of division applied to a robot's runs: one fold, or one for each session or command."""
+
+    name: str
+    folds: tuple[Fold, ...]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds that it is judged on, in the order of the folds."""
+        return tuple(dict.fromkeys(kind for fold in self.folds for kind, runs in fold.judged.items() if runs))
+
+    @property
+    def fitted_kinds(self) -> tuple[str, ...]:
+        """The kinds of whose training errors are known."""
+        return tuple(dict.fromkeys(kind for fold in self.folds for kind in fold.fitted or ()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """A data set's runs with their kinds; None: a run that is left out."""
+
+    dataset: Dataset
+    kinds: tuple[str | None, ...]
+
+    def of(self, kind: str) -> tuple[int, ...]:
+        return tuple(index for index, each in enumerate(self.kinds) if each == kind)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(kind for kind in self.kinds if kind is not None))
+
+    def runs(self, indices: Sequence[int]) -> tuple[Trajectory, ...]:
+        return tuple(self.dataset.trajectories[index] for index in indices)
+
+    def session(self, index: int) -> str | None:
+        return self.dataset.trajectories[index].session
+
+    def others(self, training: Sequence[int]) -> dict[str, tuple[int, ...]]:
+        """All runs outside a training set that are not copies of runs in it, by kind."""
+        within = set(training)
+        copies = {self.dataset.trajectories[index].fingerprint for index in training}
+        return {
+            kind: tuple(
+                index
+                for index in self.of(kind)
+                if index not in within and self.dataset.trajectories[index].fingerprint not in copies
+            )
+            for kind in self.names
+        }
+
+
+def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice], place: str) -> tuple[Training, ...]:
+    """The trainings of a robot's runs; those that nothing judges are left out.
+
+    place: what messages begin with. ConfigError: a run is of two kinds, a rule names an unknown kind, or two rules give
+    the same training. DataError: no run is of a kind, or names its session, or is left to judge by.
+    """
+    runs = _Runs(dataset, _kinds_of(dataset.trajectories, robot.kinds, place))
+    trainings: dict[str, Training] = {}
+    for rule in rules:
+        for kind in rule.kinds:
+            if kind not in runs.names:
+                hint = nearest(kind, runs.names)
+                raise ConfigError(f"{place}: no kind {kind!r} to train on; {hint}known: {', '.join(runs.names)}")
+        if "session" in (rule.by, rule.leave_out) and not all(run.session for run in dataset.trajectories):
+            raise DataError(
+                f"{place}: some runs name no session, by which they are to be divided; name them, or divide by kind"
+            )
+        for training in _trainings(runs, rule):
+            if training.name in trainings:
+                raise ConfigError(f"{place}: two trainings are {training.name!r}; leave one out")
+            if training.folds and training.kinds:
+                trainings[training.name] = training
+    if not trainings:
+        raise DataError(f"{place}: no run is left to judge by; give it another training")
+    return tuple(trainings.values())
+
+
+def _kinds_of(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> tuple[str | None, ...]:
+    if not kinds:
+        return (ONE_KIND,) * len(runs)
+    matched: list[list[str]] = [
+        [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, pattern) for pattern in patterns)]
+        for run in runs
+    ]
+    for kind, patterns in kinds.items():
+        if not any(kind in of_run for of_run in matched):
+            found = ", ".join(run.id for run in runs[:4])
+            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
+    for run, of_run in zip(runs, matched, strict=True):
+        if len(of_run) > 1:
+            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(of_run)}; make the patterns differ")
+    return tuple(of_run[0] if of_run else None for of_run in matched)
+
+
+def _trainings(runs: _Runs, rule: TrainingChoice) -> Iterator[Training]:
+    if rule.by == "split":
+        train = [
+            index for index, run in enumerate(runs.dataset.trajectories) if run.split == "train" and runs.kinds[index]
+        ]
+        judged = runs.others(train)
+        kinds = dict.fromkeys(runs.kinds[index] for index in train)
+        fold = Fold(
+            "",
+            runs.runs(train),
+            judged,
+            fitted={kind: tuple(i for i in train if runs.kinds[i] == kind) for kind in kinds if kind is not None},
+        )
+        yield Training(OWN_SPLIT, (fold,) if train else ())
+    elif rule.leave_out == "kind":
+        for kind in runs.names:
+            training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
+            if training:
+                fold = Fold("", runs.runs(training), {kind: runs.others(training)[kind]})
+                yield Training(f"all but {kind}", (fold,))
+    else:
+        for kind in rule.kinds or runs.names:
+            if rule.by == "session":
+                yield _each_session(runs, kind)
+            elif rule.by == "kind":
+                yield from _whole_kind(runs, kind, rule.runs_per_command)
+            elif rule.leave_out is not None:
+                yield _left_out(runs, kind, rule.leave_out)
+
+
+def _whole_kind(runs: _Runs, kind: str, curve: Sequence[int]) -> Iterator[Training]:
+    """All runs of a kind train; on a learning curve the first of each command, judged by what never trains."""
+    members = runs.of(kind)
+    if not curve:
+        yield Training(kind, (Fold("", runs.runs(members), runs.others(members), fitted={kind: members}),))
+        return
+    used = _first_of_commands(runs, members, max(curve))
+    most = max(repetitions([run.command or run.id for run in runs.runs(members)]), default=0)
+    for count in sorted({min(count, most) for count in curve}):
+        train = _first_of_commands(runs, members, count)
+        fold = Fold("", runs.runs(train), runs.others(used), fitted={kind: tuple(train)})
+        yield Training(f"{kind}, {plural(count, 'run')} a command", (fold,))
+
+
+def _first_of_commands(runs: _Runs, members: Sequence[int], count: int) -> list[int]:
+    chosen = runs.runs(members)
+    numbers = repetitions([run.command or run.id for run in chosen])
+    return [index for index, number in zip(members, numbers, strict=True) if number <= count]
+
+
+def _each_session(runs: _Runs, kind: str) -> Training:
+    folds = []
+    for session, members in _grouped(runs, runs.of(kind), "session").items():
+        judged = {
+            name: tuple(index for index in indices if name != kind or runs.session(index) != session)
+            for name, indices in runs.others(members).items()
+        }
+        folds.append(Fold(session, runs.runs(members), judged, session))
+    return Training(f"{kind}, one session", tuple(folds))
+
+
+def _left_out(runs: _Runs, kind: str, what: str) -> Training:
+    members = runs.of(kind)
+    folds = []
+    groups = _grouped(runs, members, what)
+    for name, judged in groups.items():
+        training = [index for index in members if index not in set(judged)]
+        others = {kind: tuple(index for index in runs.others(training)[kind] if index in set(judged))}
+        if training and others[kind]:
+            folds.append(Fold(f"without {name}", runs.runs(training), others))
+    return Training(f"{kind}, a {what} left out", tuple(folds) if len(groups) > 1 else ())
+
+
+def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[int]]:
+    """Indices by session or command; runs without one are a group each."""
+    groups: dict[str, list[int]] = {}
+    for index in members:
+        run = runs.dataset.trajectories[index]
+        groups.setdefault((run.session if what == "session" else run.command) or run.id, []).append(index)
+    return groups
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedRobot:
+    """A robot, or a data set, with its runs and how they are divided."""
+
+    name: str
+    dataset: Dataset
+    trainings: tuple[Training, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedFit:
+    """One fit: an entry of the config on the training runs of a fold, in a regime, with one seed.
+
+    dataset: what the key names, with the training runs ``training_runs``, the same object for all fits to them.
+    settings: of the fit; a geometry does not use their box. box_name: the name of the bounds that are searched, or
+    ``UNBOUNDED``. refusal: why the entry cannot be asked; empty where it can.
+    """
+
+    config: CompareConfig
+    robot: ComparedRobot
+    training: Training
+    fold: Fold
+    regime: str
+    entry: CalibratorEntry
+    dataset: Dataset
+    training_runs: tuple[Trajectory, ...]
     settings: CompleteSettings
     label: str
     box_name: str
+    refusal: str = ""
 
     @property
     def title(self) -> str:
-        """Data set, entry and seed."""
-        return f"{self.dataset_name} {self.label} seed {self.settings.seed}"
+        """Robot, training and fold where there are several, regime, entry and seed."""
+        training = "" if self.config.datasets else f"{self.training.name} {self.fold.name}".strip() + ", "
+        return f"{self.robot.name} {training}{self.label} seed {self.settings.seed}"
 
     @property
     def element_box(self) -> Box | None:
@@ -159,67 +417,145 @@ class PlannedRun:
 
     @property
     def search_space(self) -> SearchSpace:
-        """The set of matrices that the run chooses from."""
+        """The set of matrices that the fit chooses from."""
         settings = self.settings
         limits = (settings.limits or GeometryLimits()) if settings.parameterisation == "geometry" else settings.box
         return SearchSpace(settings.parameterisation, limits, self.box_name != UNBOUNDED)
 
     @property
-    def task(self) -> RunTask:
-        """The run as its worker process sees it."""
+    def task(self) -> FitTask:
+        """The fit as its worker process sees it."""
         config = self.config
-        return RunTask(self.settings, self.dataset.robot, self.training, config.plugins, config.timing)
+        return FitTask(self.settings, self.dataset.robot, self.training_runs, config.plugins, config.timing)
 
     def problem(self) -> CalibrationProblem:
-        """The run's calibration problem."""
-        return make_problem(self.settings, self.dataset.robot, self.training)
+        """The fit's calibration problem."""
+        return make_problem(self.settings, self.dataset.robot, self.training_runs)
 
     @cached_property
     def key(self) -> str:
-        """The key of the run's stored result."""
-        return run_key(self.settings, self.dataset)
+        """The key of the fit's stored result."""
+        return fit_key(self.settings, self.dataset)
 
 
-def load_datasets(config: CompareConfig, progress: Reporter = no_progress) -> dict[str, Dataset]:
-    """Read, import or simulate every data set. DataError when one has no training data."""
-    datasets = {}
+def load_robots(
+    config: CompareConfig, progress: Reporter = no_progress
+) -> tuple[tuple[ComparedRobot, ...], dict[str, str]]:
+    """The data sets, or the robots whose recordings can be read, and why not of the others, by name.
+
+    DataError: a data set cannot be read, or has no training data, or no robot's recordings can be read.
+    """
+    robots, broken = [], {}
     for name, source in config.datasets.items():
-        datasets[name] = source.load(name, config.description, progress)
-        training_split(datasets[name])
-    return datasets
+        dataset = source.load(name, config.description, progress)
+        training_split(dataset)
+        robots.append(ComparedRobot(name, dataset, (_own_split(dataset),)))
+    for number, (name, choice) in enumerate(config.robots.items()):
+        progress(Progress("reading the recordings", number, len(config.robots), "robot", note=name))
+        try:
+            dataset = choice.source(config.data, name).load(name)
+            rules = choice.trainings or config.trainings
+            robots.append(ComparedRobot(name, dataset, divide(dataset, choice, rules, f"robot {name}")))
+        except ConfigError:
+            raise
+        except OmnibenchError as error:
+            broken[name] = str(error)
+    if config.robots:
+        progress(Progress("reading the recordings", len(config.robots), len(config.robots), "robot"))
+    if not robots:
+        name, reason = next(iter(broken.items()))
+        raise DataError(f"no robot's recordings can be read, the first: {name}: {reason}")
+    return tuple(robots), broken
 
 
-def make_plan(config: CompareConfig, datasets: Mapping[str, Dataset]) -> list[PlannedRun]:
-    """Data sets x calibrators x seeds; a calibrator without randomness runs once. ConfigError for a bad box."""
-    plan = []
-    for name, dataset in datasets.items():
-        labels: set[str] = set()
-        training = dataset.split("train")
-        for entry in config.calibrators:
-            settings = config.settings(entry, config.seeds[0])
-            try:
-                box_name = name_of_bounds(settings, dataset.robot, training)
-            except ConfigError as error:
-                raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
-            # The entry's label, by default its name with the parameterisation or box that is not the usual one
-            cls = calibrators.entry(entry.name).cls
-            label = entry.label or entry.name
-            if not entry.label:
-                if settings.parameterisation != cls.parameterisation:
-                    label += f" ({settings.parameterisation})"
-                elif entry.box is not None and entry.box != config.box:
-                    label += f" ({box_name} box)"
-            if label in labels:
+def _own_split(dataset: Dataset) -> Training:
+    """The training of a data set: its own split."""
+    split = {
+        name: tuple(index for index, run in enumerate(dataset.trajectories) if run.split == name) for name in SPLITS
+    }
+    judged = {"validation": split["validation"]} if split["validation"] else {}
+    return Training(OWN_SPLIT, (Fold("", dataset.split("train"), judged, fitted={"train": split["train"]}),))
+
+
+def plan_fits(config: CompareConfig, robots: Sequence[ComparedRobot]) -> list[PlannedFit]:
+    """All fits; an entry without randomness is fitted once. ConfigError: a bad box, or a pattern matches nothing."""
+    # Every pattern must match a training or regime; while some robots cannot be read, all trainings are not known
+    trainings = list(dict.fromkeys(training.name for robot in robots for training in robot.trainings))
+    given = [(f"method {entry.shown}: trainings", entry.trainings, trainings) for entry in config.entries]
+    given += [(f"regime {name}: trainings", regime.trainings, trainings) for name, regime in config.regimes.items()]
+    given = given if len(robots) == len(config.robots or config.datasets) else []
+    given += [(f"method {entry.shown}: regimes", entry.regimes, list(config.regimes)) for entry in config.entries]
+    for place, patterns, names in given:
+        for pattern in patterns:
+            if pattern != "*" and not any(fnmatchcase(name, pattern) for name in names):
                 raise ConfigError(
-                    f"config {config.name}: two entries are called {label!r}; give one a label of its own"
+                    f"config {config.name}: {place}: none is called {pattern}; {nearest(pattern, names)}known: "
+                    f"{', '.join(names) or 'none'}"
                 )
-            labels.add(label)
-            seeds = config.seeds if calibrators.entry(entry.name).cls.stochastic else config.seeds[:1]
-            plan += [
-                PlannedRun(config, name, dataset, training, settings.model_copy(update={"seed": seed}), label, box_name)
-                for seed in seeds
-            ]
-    return plan
+    regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
+    fits = [
+        fit for robot in robots for name, regime in regimes.items() for fit in _of_robot(config, robot, name, regime)
+    ]
+    # Two entries may differ by their box alone, which their labels then name
+    for robot in robots:
+        labels: dict[str, CalibratorEntry] = {}
+        for fit in fits:
+            if fit.robot is robot and labels.setdefault(fit.label, fit.entry) is not fit.entry:
+                raise ConfigError(
+                    f"config {config.name}: two entries are called {fit.label!r}; give one a label of its own"
+                )
+    return fits
+
+
+def _of_robot(config: CompareConfig, robot: ComparedRobot, name: str, regime: RegimeChoice) -> Iterator[PlannedFit]:
+    for training in robot.trainings:
+        if not _named(training.name, regime.trainings):
+            continue
+        for fold in training.folds:
+            dataset, runs = robot.dataset, fold.training
+            if config.robots:  # what judges is not the data set's own split, and no part of the key
+                runs = in_regime(tuple(replace(run, split="train") for run in runs), regime, config.seeds[0])
+                dataset = replace(robot.dataset, trajectories=runs, scans=None)
+            if regime.of_poses and not any(run.has_poses for run in runs):
+                continue  # nothing of these runs would change
+            for entry in config.entries:
+                if _named(training.name, entry.trainings) and (name == AS_RECORDED or _named(name, entry.regimes)):
+                    fit = _with_settings(config, robot, training, fold, name, entry, dataset, runs)
+                    seeds = config.seeds if calibrators.entry(entry.name).cls.stochastic else config.seeds[:1]
+                    for seed in seeds:
+                        yield replace(fit, settings=fit.settings.model_copy(update={"seed": seed}))
+
+
+def _named(name: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _with_settings(
+    config: CompareConfig, robot: ComparedRobot, training: Training, fold: Fold, regime: str, entry: CalibratorEntry,
+    dataset: Dataset, runs: tuple[Trajectory, ...],
+) -> PlannedFit:  # fmt: skip
+    """A fit with the first seed, and why it cannot be asked, if so.
+
+    ConfigError: a data set's robot has no such parameters, or the box does not hold its design.
+    """
+    settings, refusal, box_name = config.settings(entry, dataset.robot, len(runs), config.seeds[0]), "", UNBOUNDED
+    if config.robots and not runs:
+        refusal = "no training run is left"
+    elif config.robots:
+        with suppress(PluginError):  # a constructor that raises is the outcome of the fit
+            refusal = refusal_of(calibrators.create(entry.name, entry.options), dataset.robot, runs)
+    try:
+        box_name = UNBOUNDED if refusal else name_of_bounds(settings, dataset.robot, runs)
+    except ConfigError as error:
+        if config.datasets:
+            raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
+        refusal = str(error)
+    label = entry.shown
+    if not entry.label and settings.parameterisation != calibrators.entry(entry.name).cls.parameterisation:
+        label += f" ({settings.parameterisation})"
+    elif not entry.label and entry.box is not None and entry.box != config.box:
+        label += f" ({box_name} box)"
+    return PlannedFit(config, robot, training, fold, regime, entry, dataset, runs, settings, label, box_name, refusal)
 
 
 def name_of_bounds(settings: CompleteSettings, robot: Robot, training: Sequence[Trajectory]) -> str:

@@ -1,33 +1,31 @@
-"""The result of a comparison: a record of every run, its scores on each split, and statistics of every entry."""
+"""The result of a comparison: every fit with its scores, statistics of entries, and cells of several robots."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import SearchSpace
+from omnibench.compare.config import AS_RECORDED, CompareConfig
+from omnibench.compare.plan import ComparedRobot, PlannedFit, SearchSpace
+from omnibench.compare.ratios import CellRatio, Pairs, cell_ratio
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split
 from omnibench.environment import Environment
-from omnibench.fit.calibrator import Outcome
+from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.intervals import Clusters, Interval
 from omnibench.fit.parameterisation import ParameterisationName
-from omnibench.fit.problem import Improvement
 from omnibench.fit.uncertainty import Uncertainty
 from omnibench.registry import calibrators
-from omnibench.robot.calibration import HeldOutVerdict, ModelExtension, Noise, Row
+from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.views import Shown
-
-THEORETICAL_NAME = "theoretical"  # the calibrator that leaves the design values
-
 
 _DEVIATIONS = ("deviation", "deviation_percent")  # keys of summary.json that follow from value and design
 
@@ -119,25 +117,36 @@ class SplitScore:
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredRun:
-    """A run with its scores.
+class ScoredFit:
+    """A fit with its result and scores.
 
-    history: the best cost so far. scores: by split, those with trajectories; empty without an answer. design: scores of
-    the design values, by split. extension, noise: as in RunResult.
+    errors (Z, 3): of its answer on all runs of the robot, m, m, rad; None without one. record: the row of a fit to a
+    data set. scores: by split of a data set, those with trajectories; empty without an answer. design: scores of the
+    design values, by split.
     """
 
-    record: RunRecord
-    search_space: SearchSpace
-    history: tuple[Improvement, ...]
+    fit: PlannedFit
+    result: RunResult
+    errors: Array | None
+    row: RunRecord | None
     scores: Mapping[Split, SplitScore]
     design: Mapping[Split, SplitScore]
-    extension: ModelExtension | None = None
-    noise: Noise | None = None
+
+    @property
+    def record(self) -> RunRecord:
+        """The row of a fit to a data set."""
+        assert self.row is not None  # it is one
+        return self.row
+
+    @property
+    def search_space(self) -> SearchSpace:
+        """The set of matrices that it chose from."""
+        return self.fit.search_space
 
     @property
     def matrix(self) -> Array | None:
-        """The inverse kinematic matrix (3, N)."""
-        return None if self.record.matrix is None else np.array(self.record.matrix)
+        """The inverse kinematic matrix (3, N) of its answer."""
+        return self.result.matrix
 
 
 @dataclass(frozen=True)
@@ -169,7 +178,7 @@ class EntryStatistics:
     box: str
     runs: int
     answers: int
-    typical: ScoredRun | None
+    typical: ScoredFit | None
     train_median: float | None
     train_spread: float | None
     splits: Mapping[Split, SplitStatistics]
@@ -210,39 +219,172 @@ class TypicalAnswer:
     parameters: tuple[PhysicalParameter, ...]
 
 
+Measure = Literal["cost", "position", "heading"]
+MEASURES: tuple[Measure, ...] = ("cost", "position", "heading")
+
+
+@dataclass(frozen=True)
+class CellKey:
+    """Name of a cell. fitted: the judged runs are those that trained: training errors, which no verdict rests on."""
+
+    robot: str
+    training: str
+    regime: str
+    judged: str
+    fitted: bool
+
+    @property
+    def words(self) -> str:
+        """The cell in words."""
+        regime = "" if self.regime == AS_RECORDED else f", {self.regime}"
+        return f"{self.robot}: {self.training} -> {self.judged}{regime}"
+
+
+@dataclass(frozen=True, eq=False)
+class MethodInCell:
+    """One method in a cell. errors: by measure, (n,) of each pair, means over seeds; the design's where it has none.
+
+    fits, answers: how many were asked for and answered; outcomes: how many ended so. reason: of the first without an
+    answer. seconds: median of a fit; numbers: what the method says of its first answer, matrix (3, M): that answer's.
+    cost, unidentified: what was minimised, and what became of motions that were hardly driven; empty where it was never
+    asked.
+    """
+
+    method: str
+    family: str
+    fits: int
+    outcomes: Mapping[str, int]
+    reason: str
+    errors: Mapping[Measure, Array] | None
+    seconds: float | None
+    numbers: str
+    answers: int
+    cost: str = ""
+    unidentified: str = ""
+    matrix: Array | None = None
+
+    def mean(self, measure: Measure) -> float | None:
+        """Mean error over the pairs: Eq. (6), m, or rad."""
+        return None if self.errors is None else float(self.errors[measure].mean())
+
+    @property
+    def status(self) -> str:
+        """``answered``, or the commonest reason in a word why not; in how many fits, where these differ."""
+        if self.answers == self.fits:
+            return "answered"
+        if self.answers:
+            return f"answered in {self.answers} of {self.fits}"
+        return max(self.outcomes, key=lambda outcome: self.outcomes[outcome])
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A cell: its pairs, the design values' errors and the methods by name."""
+
+    key: CellKey
+    pairs: Pairs
+    design: Mapping[Measure, Array]
+    methods: Mapping[str, MethodInCell]
+
+    def mean(self, method: str) -> float | None:
+        """A method's mean error, Eq. (6); None where it was not asked, or has no answer."""
+        return self.methods[method].mean("cost") if method in self.methods else None
+
+    def against_design(self, method: str, cells: int) -> CellRatio | None:
+        """A method's mean error, Eq. (6), as a ratio to the design values'; None without an answer."""
+        errors = self.methods[method].errors if method in self.methods else None
+        return None if errors is None else cell_ratio(errors["cost"], self.design["cost"], self.pairs, cells)
+
+    def between(self, method: str, other: str, cells: int) -> CellRatio | None:
+        """The ratio of two methods' mean errors, Eq. (6); None where one has no answer."""
+        one, two = self.methods[method].errors, self.methods[other].errors
+        if one is None or two is None:
+            return None
+        return cell_ratio(one["cost"], two["cost"], self.pairs, cells)
+
+
+@dataclass(frozen=True, eq=False)
+class AgainstBest:
+    """The reference method beside the published method of least mean error in a cell, Eq. (6)."""
+
+    cell: Cell
+    best: str
+    ratio: CellRatio
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ComparisonResult(Shown):
     """Everything that the report shows.
 
-    design_costs: mean cost of the design values, by data set and split. typical: of the entries' typical runs, by data
-    set and label. held_out: the verdict on the best calibration of each data set that has one. sessions: by data
-    set, sentences on sessions that differ from the others or could not be compared.
+    broken: why recordings could not be read, by robot. Of data sets alone: statistics of every entry; design_costs,
+    mean cost of the design values, by data set and split; typical, of the entries' typical runs, by data set and label;
+    held_out, the verdict on the best calibration of each that has one; sessions, sentences on those that differ from
+    the others or could not be compared.
     """
 
     config: CompareConfig
     output: Path
-    datasets: dict[str, Dataset]
-    runs: tuple[ScoredRun, ...]
+    robots: tuple[ComparedRobot, ...]
+    broken: Mapping[str, str]
+    runs: tuple[ScoredFit, ...]
+    cells: tuple[Cell, ...]
     statistics: tuple[EntryStatistics, ...]
     design_costs: Mapping[str, Mapping[Split, Interval]]
     certificates: tuple[BoxCertificate, ...]
     typical: Mapping[tuple[str, str], TypicalAnswer]
     held_out: Mapping[str, EntryVerdict]
+    sessions: Mapping[str, tuple[str, ...]]
     environment: Environment
     warnings: tuple[str, ...]
-    sessions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
-    def every_search_failed(self) -> bool:
-        """True if none of the calibrators that fit to data, or none of all if there are no such, gave an answer."""
-        fitted = [run for run in self.runs if calibrators.entry(run.record.calibrator).cls.fitted]
-        return all(run.matrix is None for run in fitted or self.runs)
+    def datasets(self) -> dict[str, Dataset]:
+        """The data sets, or the robots' recordings, by name."""
+        return {robot.name: robot.dataset for robot in self.robots}
 
     @property
-    def failures(self) -> list[str]:
-        """A line for every run without an answer: data set, entry, seed, outcome and reason."""
-        return [
-            f"{record.dataset} {record.label} seed {record.seed}: {record.outcome}: {record.reason}"
-            for record in (run.record for run in self.runs)
-            if record.matrix is None
-        ]
+    def nothing_answered(self) -> bool:
+        """True if no calibrator that fits to data, or none of all if there are no such, gave an answer anywhere."""
+        fitted = [run for run in self.runs if calibrators.entry(run.fit.entry.name).cls.fitted]
+        return not any(run.errors is not None for run in fitted or self.runs)
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """A line for every fit that ought to have an answer and has none, with outcome and reason."""
+        silent = [run for run in self.runs if run.errors is None]
+        if self.config.robots:  # a method that is not for a robot is none
+            silent = [run for run in silent if run.result.outcome in (Outcome.FAILED, Outcome.INVALID)]
+        return tuple(f"{run.fit.title}: {run.result.outcome}: {run.result.reason}" for run in silent)
+
+    @property
+    def judged_cells(self) -> tuple[Cell, ...]:
+        """Cells of recorded training runs that other runs judge: what verdicts, ranks and profiles rest on."""
+        return tuple(cell for cell in self.cells if not cell.key.fitted and cell.key.regime == AS_RECORDED)
+
+    @cached_property
+    def against_best(self) -> tuple[AgainstBest, ...]:
+        """The reference method against the best published one, in every judged cell that has both."""
+        name = self.config.reference or ""
+        compared = []
+        for cell in self.judged_cells if name else ():
+            published = [
+                each for each in cell.methods.values() if each.family == "published" and each.errors is not None
+            ]
+            if published and cell.mean(name) is not None:
+                compared.append((cell, min(published, key=lambda each: each.mean("cost") or 0.0).method))
+        found = []
+        for cell, best in compared:
+            ratio = cell.between(name, best, len(compared))
+            assert ratio is not None  # both have answers
+            found.append(AgainstBest(cell, best, ratio))
+        return tuple(found)
+
+    @property
+    def geometric_mean(self) -> float | None:
+        """Geometric mean over cells of the reference's error as a ratio to the best published one's."""
+        return mean_ratio([each.ratio.value for each in self.against_best])
+
+
+def mean_ratio(ratios: Sequence[float]) -> float | None:
+    """The geometric mean of some ratios; None of none, or where one is 0."""
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios and min(ratios) > 0 else None

@@ -1,26 +1,56 @@
-"""Statistics of the entries: medians over seeds, intervals over commands or runs, paired differences."""
+"""Statistics of a comparison: of entries over their seeds, with paired differences; of cells over several robots.
+
+Statistics of entries: medians over seeds, intervals over commands or runs, paired differences.
+
+Ranks: Friedman's test asks whether k methods that were all judged in N cells differ at all; two whose mean ranks are
+closer than the critical difference of Nemenyi's test are not told apart (Demsar, J. Mach. Learn. Res. 7:1, 2006):
+
+    CD = q sqrt(k (k + 1) / (6 N)),                                                                (K1)
+
+q being the 95 % point of the studentised range of k, divided by sqrt 2. It takes cells for independent; cells of one
+robot share runs, so the critical difference is a lower bound.
+
+Profiles: the share of cells in which a method's error is at most t times that of the best one there (Dolan and More,
+Math. Program. 91:201, 2002). Where a method has no answer its error is infinite.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
+from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
-from omnibench.compare.result import EntryStatistics, EntryVerdict, ScoredRun, SplitScore, SplitStatistics
+from omnibench.compare.config import AS_RECORDED
+from omnibench.compare.plan import ComparedRobot, Fold, Training
+from omnibench.compare.ratios import Pairs
+from omnibench.compare.result import (
+    MEASURES,
+    Cell,
+    CellKey,
+    EntryStatistics,
+    EntryVerdict,
+    Measure,
+    MethodInCell,
+    ScoredFit,
+    SplitScore,
+    SplitStatistics,
+)
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.evaluate import judge, nothing_held_out
 from omnibench.fit.intervals import Bootstrap, Interval, RatioIntervals
-from omnibench.fit.sessions import compare_sessions
 from omnibench.registry import calibrators
-from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import Integration
+from omnibench.robot.kinematics import Array
 
 # Share of the standard error of the best cost: a smaller difference is of no practical interest (chosen).
 NEGLIGIBLE_SHARE = 0.1
 
 
-def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[EntryStatistics, ...]:
+def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[EntryStatistics, ...]:
     """Statistics of every entry on every data set, in the order of the runs.
 
     An entry is practically equal to another when the 95 % interval of the paired difference of their typical runs'
@@ -29,7 +59,7 @@ def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[E
     data set has the lowest training cost among those that are not known to differ from the one of lowest validation
     cost.
     """
-    groups: dict[tuple[str, str], list[ScoredRun]] = {}
+    groups: dict[tuple[str, str], list[ScoredFit]] = {}
     for run in runs:
         groups.setdefault((run.record.dataset, run.record.label), []).append(run)
     typical = {key: _typical(group) for key, group in groups.items()}
@@ -80,7 +110,7 @@ def entry_statistics(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> tuple[E
     return tuple(statistics)
 
 
-def design_costs(runs: Sequence[ScoredRun], bootstrap: Bootstrap) -> dict[str, dict[Split, Interval]]:
+def design_costs(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> dict[str, dict[Split, Interval]]:
     """The mean cost of the design values, by data set and split."""
     designs = {run.record.dataset: run.design for run in runs}
     intervals = RatioIntervals(bootstrap)
@@ -113,22 +143,13 @@ def held_out_verdicts(
     return verdicts
 
 
-def sessions_that_differ(datasets: Mapping[str, Dataset], integration: Integration) -> dict[str, tuple[str, ...]]:
-    """By data set, sentences on sessions that differ or could not be compared by the design values (any would do)."""
-    found = {
-        name: compare_sessions(OdometryModel.of_design(dataset.robot, integration), dataset.trajectories)
-        for name, dataset in datasets.items()
-    }
-    return {name: (*comparison.sentences, *comparison.doubts) for name, comparison in found.items()}
-
-
-def is_mean(run: ScoredRun) -> bool:
+def is_mean(run: ScoredFit) -> bool:
     """True if the run's cost is the mean of its trajectories' costs, as the intervals and differences suppose."""
     train = run.scores.get("train")
     return train is None or bool(np.isclose(train.costs.mean(), train.cost, rtol=1e-6, atol=0.0))
 
 
-def _best(competing: Sequence[ScoredRun], intervals: RatioIntervals) -> ScoredRun | None:
+def _best(competing: Sequence[ScoredFit], intervals: RatioIntervals) -> ScoredFit | None:
     """The run of lowest training cost among those practically equal to the one of lowest judged cost."""
     if not competing:
         return None
@@ -137,23 +158,23 @@ def _best(competing: Sequence[ScoredRun], intervals: RatioIntervals) -> ScoredRu
     return min(rivals, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
-def _typical(group: Sequence[ScoredRun]) -> ScoredRun | None:
+def _typical(group: Sequence[ScoredFit]) -> ScoredFit | None:
     """The run of median training cost (the worse one of two), of those with an answer."""
     answered = [run for run in group if run.record.train_cost is not None]
     ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
     return ranked[len(ranked) // 2] if ranked else None
 
 
-def _judged(run: ScoredRun) -> SplitScore:
+def _judged(run: ScoredFit) -> SplitScore:
     """The score that an answer is judged by: on the validation split where there is one."""
     return run.scores["validation" if "validation" in run.scores else "train"]
 
 
-def _judged_cost(run: ScoredRun) -> float:
+def _judged_cost(run: ScoredFit) -> float:
     return float(_judged(run).costs.mean())
 
 
-def _against_best(run: ScoredRun, best: ScoredRun, intervals: RatioIntervals) -> tuple[Interval, bool | None]:
+def _against_best(run: ScoredFit, best: ScoredFit, intervals: RatioIntervals) -> tuple[Interval, bool | None]:
     """The paired difference in judged cost from the best run, and whether the two are practically equal, if known."""
     score, of_best = _judged(run), _judged(best)
     difference = intervals.difference(score.costs - of_best.costs, score.units)
@@ -167,3 +188,171 @@ def _standard_error(score: SplitScore) -> float:
     """The standard error of a mean cost by the sums over its units."""
     left = score.units.sums(score.costs - score.costs.mean())
     return float(np.sqrt(len(left) / (len(left) - 1) * np.square(left).sum()) / len(score.costs))
+
+
+def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tuple[Cell, ...]:
+    """All cells, in the order of the fits. design: by robot, errors (Z, 3) of the design values."""
+    groups: dict[tuple[str, str, str], list[ScoredFit]] = {}
+    for each in judged:
+        groups.setdefault((each.fit.robot.name, each.fit.training.name, each.fit.regime), []).append(each)
+    cells = []
+    for (robot_name, training_name, regime), fits in groups.items():
+        robot, training = fits[0].fit.robot, fits[0].fit.training
+        for fitted, kinds in ((False, training.kinds), (True, training.fitted_kinds)):
+            for kind in kinds:
+                if fitted and regime != AS_RECORDED:
+                    continue
+                key = CellKey(robot_name, training_name, regime, kind, fitted)
+                cells.append(_cell(key, robot, training, fits, design[robot_name]))
+    return tuple(cells)
+
+
+def _cell(key: CellKey, robot: ComparedRobot, training: Training, fits: Sequence[ScoredFit], design: Array) -> Cell:
+    pairs = _pairs(robot, training.folds, key)
+    folds = {id(fold): number for number, fold in enumerate(training.folds)}
+    by_method: dict[str, list[ScoredFit]] = {}
+    for each in fits:
+        by_method.setdefault(each.fit.label, []).append(each)
+    designs = np.broadcast_to(design, (len(training.folds), *design.shape))
+    return Cell(
+        key,
+        pairs,
+        _measured(designs, pairs),
+        {name: _method(name, of_one, folds, pairs, designs) for name, of_one in by_method.items()},
+    )
+
+
+def _pairs(robot: ComparedRobot, folds: Sequence[Fold], key: CellKey) -> Pairs:
+    runs = robot.dataset.trajectories
+    listed = [
+        (number, index)
+        for number, fold in enumerate(folds)
+        for index in ((fold.fitted or {}) if key.fitted else fold.judged).get(key.judged, ())
+    ]
+    return Pairs(
+        np.array([number for number, _ in listed], dtype=int),
+        np.array([index for _, index in listed], dtype=int),
+        tuple(folds[number].session for number, _ in listed),
+        tuple(runs[index].session for _, index in listed),
+    )
+
+
+def _method(
+    name: str, fits: Sequence[ScoredFit], folds: Mapping[int, int], pairs: Pairs, designs: Array
+) -> MethodInCell:
+    answered = [each for each in fits if each.errors is not None]
+    silent = next((each.result.reason for each in fits if each.errors is None), "")
+    errors = None
+    if answered:
+        seeds = list(dict.fromkeys(each.fit.settings.seed for each in fits))
+        of_seeds = []
+        for seed in seeds:
+            of_folds = np.array(designs)
+            for each in answered:
+                if each.fit.settings.seed == seed and each.errors is not None:
+                    of_folds[folds[id(each.fit.fold)]] = each.errors
+            of_seeds.append(_measured(of_folds, pairs))
+        errors = {measure: np.mean([of_one[measure] for of_one in of_seeds], axis=0) for measure in MEASURES}
+    asked = [each.fit.settings for each in fits if not each.fit.refusal]
+    seconds = [each.result.seconds for each in answered]
+    return MethodInCell(
+        method=name,
+        family=fits[0].fit.entry.family,
+        fits=len(fits),
+        outcomes=Counter(str(each.result.outcome) for each in fits),
+        reason=silent,
+        errors=errors,
+        seconds=float(np.median(seconds)) if seconds else None,
+        numbers=answered[0].result.reason if answered else "",
+        answers=len(answered),
+        cost=", ".join(dict.fromkeys(settings.objective for settings in asked)),
+        unidentified=", ".join(dict.fromkeys(settings.unidentified for settings in asked)),
+        matrix=answered[0].matrix if answered else None,
+    )
+
+
+def _measured(errors: Array, pairs: Pairs) -> dict[Measure, Array]:
+    """Eq. (6), distances (m) and headings (rad), (n,) each, from errors (folds, Z, 3)."""
+    of_pairs = errors[pairs.folds, pairs.runs]
+    return {
+        "cost": np.linalg.norm(of_pairs, axis=1),
+        "position": np.hypot(of_pairs[:, 0], of_pairs[:, 1]),
+        "heading": np.abs(of_pairs[:, 2]),
+    }
+
+
+_LEVEL = 0.95
+_FEWEST_METHODS = 3  # methods that Friedman's test compares at least
+_FEWEST_CELLS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Mean ranks (k,) of methods over cells, 1 the best, in that order. p_value: Friedman's.
+
+    critical_difference: of mean ranks, Eq. (K1). groups: indices of the first and last of methods that are not told
+    apart.
+    """
+
+    methods: tuple[str, ...]
+    ranks: Array
+    cells: int
+    p_value: float
+    critical_difference: float
+    groups: tuple[tuple[int, int], ...]
+
+
+def ranking(cells: Sequence[Cell], methods: Sequence[str]) -> Ranking | None:
+    """The ranks of the methods that answered in every cell; None where methods or cells are too few."""
+    # The methods that answered in every cell
+    names = tuple(name for name in methods if all(cell.mean(name) is not None for cell in cells))
+    if len(names) < _FEWEST_METHODS or len(cells) < _FEWEST_CELLS:
+        return None
+    errors = np.array([[cell.methods[name].mean("cost") for name in names] for cell in cells], dtype=float)
+    ranks = np.array([rankdata(of_cell) for of_cell in errors]).mean(axis=0)
+    order = np.argsort(ranks, kind="stable")
+    k, count = len(names), len(cells)
+    quantile = float(studentized_range.ppf(_LEVEL, k, np.inf)) / math.sqrt(2)
+    difference = quantile * math.sqrt(k * (k + 1) / (6 * count))
+    alike = bool(np.ptp(errors, axis=1).max() == 0)
+    p_value = 1.0 if alike else float(friedmanchisquare(*errors.T).pvalue)
+    ordered = ranks[order]
+    # The longest stretches of ordered ranks whose ends are closer than a difference
+    spans: list[tuple[int, int]] = []
+    for first in range(len(ordered)):
+        last = int(np.searchsorted(ordered, ordered[first] + difference, side="right")) - 1
+        if last > first and (not spans or last > spans[-1][1]):
+            spans.append((first, last))
+    return Ranking(tuple(names[index] for index in order), ordered, count, p_value, difference, tuple(spans))
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Performance profile of a method: the errors' ratios to the best in each cell, sorted, those of answers only."""
+
+    method: str
+    ratios: Array
+    cells: int
+
+    def share(self, factor: float) -> float:
+        """The share of all cells in which its error is at most ``factor`` times the best."""
+        return float(np.searchsorted(self.ratios, factor * (1 + 1e-12), side="right")) / self.cells
+
+
+def profiles(cells: Sequence[Cell], methods: Sequence[str]) -> tuple[Profile, ...]:
+    """The profile of every method that was asked in all cells and answered in some."""
+    best = [
+        min((mean for each in cell.methods.values() if (mean := each.mean("cost")) is not None), default=math.inf)
+        for cell in cells
+    ]
+    made = []
+    for name in methods:
+        if not all(name in cell.methods for cell in cells):
+            continue
+        means = [cell.methods[name].mean("cost") for cell in cells]
+        ratios = [
+            mean / lowest if lowest > 0 else 1.0 for mean, lowest in zip(means, best, strict=True) if mean is not None
+        ]
+        if ratios:
+            made.append(Profile(name, np.sort(ratios), len(cells)))
+    return tuple(made)

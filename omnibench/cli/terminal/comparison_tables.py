@@ -13,18 +13,19 @@ from omnibench.compare.output import calibration_file
 from omnibench.compare.report.cost_tables import cost_table
 from omnibench.compare.report.error_figures import final_error_table
 from omnibench.compare.report.outcome_tables import entry_table, run_table
+from omnibench.compare.report.study_report import cell_words
 from omnibench.compare.report.view import views
-from omnibench.compare.result import ComparisonResult
+from omnibench.compare.result import ComparisonResult, mean_ratio
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, fixed
 from omnibench.robot.calibration import read_calibration
-from omnibench.study.report import cell_words
-from omnibench.study.study_result import StudyResult, mean_ratio
 from omnibench.words import kind_of_data, plural
 
 
 def print_result(console: Console, result: ComparisonResult) -> None:
-    """Print the tables of every data set, and the runs without an answer."""
+    """Print the tables of every data set, or of the cells, and the runs without an answer."""
+    if result.config.robots:
+        return _print_cells(console, result)
     for view in views(result):
         kind = kind_of_data(view.dataset.simulated)
         console.print(f"{view.name} ({kind}), cost {result.config.objective}", soft_wrap=True)
@@ -36,11 +37,19 @@ def print_result(console: Console, result: ComparisonResult) -> None:
         console.print()
     for failure in result.failures:
         console.print(f"no answer: {failure}", soft_wrap=True)
+    return None
 
 
-def print_comparison_ending(result: ComparisonResult) -> None:
-    """Print the last sentence of ``compare``: which entry is best, and how to use or to check its calibration."""
-    compared = f"{plural(len({run.record.label for run in result.runs}), 'entry')} compared"
+def print_comparison_ending(result: ComparisonResult) -> bool:
+    """Print the last sentence of ``compare``; False where a recording cannot be read or no calibrator answered."""
+    if result.nothing_answered:
+        first = result.failures[0] if result.failures else "no method is for these robots"
+        what = "no method gave an answer" if result.config.robots else "every search failed"
+        print_ending(f"{what}, the first: {first}", "mend what its reason names, and run again")
+        return False
+    if result.config.robots:
+        return _print_cells_ending(result)
+    compared = f"{plural(len({run.fit.label for run in result.runs}), 'entry')} compared"
     name, best = next(iter(result.held_out.items()), ("", None))
     file = None if best is None else calibration_file(result, name, best.label)
     if best is None or file is None:
@@ -51,12 +60,13 @@ def print_comparison_ending(result: ComparisonResult) -> None:
     else:
         unsure = f"{compared}; that the best on {name}, {best.label}, beats the design was not shown by runs held out"
         print_ending(unsure, f"read {result.output / 'report.html'} and record more runs for validation")
+    return True
 
 
 _SHOWN = 10  # failures that are listed; the others are counted (chosen: half a terminal)
 
 
-def print_study(console: Console, result: StudyResult) -> None:
+def _print_cells(console: Console, result: ComparisonResult) -> None:
     """Print the table of cells, the recordings that cannot be read and the fits that failed."""
     console.print()
     print_table(console, _cells(result))
@@ -71,13 +81,8 @@ def print_study(console: Console, result: StudyResult) -> None:
         console.print(f"and {len(result.failures) - _SHOWN} more without an answer, see study.parquet", soft_wrap=True)
 
 
-def print_study_ending(result: StudyResult) -> bool:
-    """Print the last sentence of a study; False where a recording cannot be read or no method answered."""
+def _print_cells_ending(result: ComparisonResult) -> bool:
     report = result.output / "report.html"
-    if result.nothing_answered:
-        first = result.failures[0] if result.failures else "no method is for these robots"
-        print_ending(f"no method gave an answer, the first: {first}", "mend what its reason names, and run again")
-        return False
     if result.broken:
         ending = f"{plural(len(result.broken), 'robot')} left out, whose recordings cannot be read"
         print_ending(ending, "say where they are with --data, or take them out of the config, and run again")
@@ -95,11 +100,11 @@ def print_study_ending(result: StudyResult) -> bool:
     return True
 
 
-def _methods(result: StudyResult) -> Table:
+def _methods(result: ComparisonResult) -> Table:
     """Every method on every robot: geometric mean over cells of its error as a share of the design's, or why none."""
     robots = [robot.name for robot in result.robots]
     rows = []
-    for method in (choice.shown for choice in result.config.methods):
+    for method in (choice.shown for choice in result.config.entries):
         cells = []
         for robot in robots:
             mine = [c for c in result.judged_cells if c.key.robot == robot and method in c.methods]
@@ -113,7 +118,7 @@ def _methods(result: StudyResult) -> Table:
     return Table(caption, columns, tuple(rows), "Every cell and method, with reasons: report.html and study.parquet.")
 
 
-def _cells(result: StudyResult) -> Table:
+def _cells(result: ComparisonResult) -> Table:
     """The least error of each cell beside the design's and the reference method's."""
     ratios = {id(each.cell): each for each in result.against_best}
     reference = result.config.reference

@@ -15,6 +15,7 @@ from omnibench.compare.report.error_figures import error_section, path_section
 from omnibench.compare.report.headline import answer_of, path_picture
 from omnibench.compare.report.outcome_tables import matrix_section, outcome_section
 from omnibench.compare.report.search_figures import search_section
+from omnibench.compare.report.study_report import study_document
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import SPLITS, Trajectory
 from omnibench.errors import DataError
@@ -155,7 +156,9 @@ def _tracks(view: sets.DatasetView) -> page.FigureGrid:
 
 
 def comparison_document(result: ComparisonResult) -> page.Document:
-    """The report as blocks, data set by data set."""
+    """The report as blocks, data set by data set, or of several robots."""
+    if result.config.robots:
+        return study_document(result)
     datasets = sets.views(result)
     if len(datasets) == 1:
         body = _sections(datasets[0], "")

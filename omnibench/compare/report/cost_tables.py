@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omnibench.compare.config import PublishedResult
+from omnibench.compare.config import THEORETICAL_NAME, PublishedResult
 from omnibench.compare.report import view as views
-from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
+from omnibench.compare.result import EntryStatistics
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
@@ -29,8 +29,8 @@ def published_blocks(view: views.DatasetView) -> tuple[Block, ...]:
     """Our figures beside the published ones, and the circumstances of both; nothing where none are published."""
     if not view.config.published_results:
         return ()
-    if view.config.cost.name != _PUBLISHED_COST:
-        remark = f"They are of the cost {_PUBLISHED_COST}, Eq. (6); this comparison's is {view.config.cost.name}."
+    if view.config.cost_name != _PUBLISHED_COST:
+        remark = f"They are of the cost {_PUBLISHED_COST}, Eq. (6); this comparison's is {view.config.cost_name}."
         return (Callout("The published costs cannot be set beside these", (remark,), "warning"),)
     remarks = tuple(dict.fromkeys(remark for result in view.config.published_results for remark in result.remarks))
     about = (Callout("About the published figures", remarks),) if remarks else ()

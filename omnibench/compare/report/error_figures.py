@@ -18,7 +18,7 @@ from omnibench.compare.report.view import (
     mean_and_worst,
     position_unit,
 )
-from omnibench.compare.result import EntryStatistics, ScoredRun
+from omnibench.compare.result import EntryStatistics, ScoredFit
 from omnibench.data.dataset import Split, Trajectory
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.report import blocks as page
@@ -81,7 +81,9 @@ def drawn_models(view: DatasetView, trajectories: Sequence[Trajectory]) -> list[
     finals = [trajectory.final_log for trajectory in trajectories]
     last = np.array([trajectory.final_pose[:2] for trajectory in trajectories])
     calibrated = sorted(view.calibrated, key=lambda pair: not pair[0].is_best)  # the best one leads its group
-    models = {entry.label: view.model(run.matrix, run.extension) for entry, run in calibrated if run.matrix is not None}
+    models = {
+        entry.label: view.model(run.matrix, run.result.extension) for entry, run in calibrated if run.matrix is not None
+    }
     ends = {label: np.array([poses[-1, :2] for poses in model.poses(finals)]) for label, model in models.items()}
     off = [1e3 * np.linalg.norm(end - last, axis=1) for end in ends.values()]
     seen = [2e-3 * _SEEN * _window(list(of_run)) for of_run in np.transpose(off)]  # m, of each run
@@ -186,7 +188,7 @@ def _ends_in_words(view: DatasetView, trajectory: Trajectory) -> str:
     parts = [f"design values {_distance_mm(design[-1], trajectory.final_pose):.0f} mm off"]
     best = view.best
     if best is not None and best.typical is not None and best.typical.matrix is not None:
-        (pose,) = view.model(best.typical.matrix, best.typical.extension).poses([trajectory.final_log])
+        (pose,) = view.model(best.typical.matrix, best.typical.result.extension).poses([trajectory.final_log])
         parts.append(f"{best.label} {_distance_mm(pose[-1], trajectory.final_pose):.0f} mm")
     return ", ".join(parts)
 
@@ -374,7 +376,7 @@ def _turns_on_the_spot(view: DatasetView, trajectories: Sequence[Trajectory], af
     return (page.Paragraph(f"Turns on the spot have no direction and are not drawn: {', '.join(parts)}.", "note"),)
 
 
-def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredRun) -> page.FigureGrid:
+def _box_plots(view: DatasetView, best: EntryStatistics, typical: ScoredFit) -> page.FigureGrid:
     """Box plots over the trajectories of each command or session, on both splits."""
     groups: list[str] = []
     before, after = [], []

@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 import plotly.graph_objects as go
 
+from omnibench.compare.config import THEORETICAL_NAME
 from omnibench.compare.report import view as views
-from omnibench.compare.result import THEORETICAL_NAME, EntryStatistics
+from omnibench.compare.result import EntryStatistics
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.intervals import Interval
@@ -119,7 +120,7 @@ def path_picture(view: views.DatasetView) -> blocks.FigureGrid | None:
         run = best.typical
         if run.matrix is not None:
             style = blocks.LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
-            models.append((style, view.model(run.matrix, run.extension)))
+            models.append((style, view.model(run.matrix, run.result.extension)))
     return paths_before_after(view.dataset.split(view.scored), models, views.SPLIT_NAMES[view.scored])
 
 

@@ -17,7 +17,7 @@ import plotly.graph_objects as go
 
 from omnibench.compare.plan import SearchSpace
 from omnibench.compare.report.view import DatasetView, cost_in_words
-from omnibench.compare.result import ScoredRun
+from omnibench.compare.result import ScoredFit
 from omnibench.fit.calibrators.genetic import GeneticOptions
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem, Paragraph, Section
@@ -38,7 +38,7 @@ def search_diagram(view: DatasetView) -> FigureGrid:
     """From the design values over candidates and their costs to the answer: Fig. 4 of the paper, or any search."""
     config, runs = view.config, len(view.dataset.split("train"))
     euler = "Euler steps, Eq. (1)" if config.integration == "euler" else "exact arcs"
-    is_paper = config.cost.name == "final_pose"
+    is_paper = config.cost_name == "final_pose"
     stop = f"{count(config.budget.evaluations)} evaluations"
     genetic = next((run.record for _, entry, run in view.published_entries if entry.calibrator == "genetic"), None)
     if genetic is None:
@@ -118,7 +118,7 @@ class Course:
     cost that any run reached in the same search space.
     """
 
-    run: ScoredRun
+    run: ScoredFit
     style: LegendItem
     evaluations: Array
     seconds: Array
@@ -191,7 +191,7 @@ def courses(view: DatasetView) -> list[Course]:
     return drawn
 
 
-def _best_known(run: ScoredRun, lowest: float) -> float:
+def _best_known(run: ScoredFit, lowest: float) -> float:
     """The cost that a run's gap is measured from."""
     record = run.record
     if record.gap is None or record.train_cost is None:
@@ -231,21 +231,21 @@ def _first_times(course: Course, axis: Axis) -> Array:
     return times
 
 
-def _reached(view: DatasetView, run: ScoredRun) -> float | None:
+def _reached(view: DatasetView, run: ScoredFit) -> float | None:
     """The answer's training cost; under a robust loss, by which answers are not scored, the best one of the search."""
     if view.config.loss == "squares":
         return run.record.train_cost
-    return min((step.cost for step in run.history), default=None)
+    return min((step.cost for step in run.result.history), default=None)
 
 
-def _with_answer(view: DatasetView, run: ScoredRun) -> tuple[Improvement, ...]:
+def _with_answer(view: DatasetView, run: ScoredFit) -> tuple[Improvement, ...]:
     """The history, followed by the answer at the run's total evaluations and time."""
     record, reached = run.record, _reached(view, run)
     if reached is None:
-        return run.history
-    lowest = min((step.cost for step in run.history), default=math.inf)
+        return run.result.history
+    lowest = min((step.cost for step in run.result.history), default=math.inf)
     last = Improvement(max(record.evaluations, 1), record.seconds, min(reached, lowest))
-    return (*run.history, last)
+    return (*run.result.history, last)
 
 
 def _groups(drawn: Sequence[Course]) -> Mapping[LegendItem, list[Course]]:

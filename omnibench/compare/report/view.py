@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omnibench.compare import result as results
-from omnibench.compare.config import CompareConfig, PublishedResult
+from omnibench.compare.config import THEORETICAL_NAME, CompareConfig, PublishedResult
 from omnibench.compare.plan import UNBOUNDED
 from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
 from omnibench.fit.evaluate import final_errors
@@ -53,7 +53,7 @@ class DatasetView:
     name: str
     config: CompareConfig
     dataset: Dataset
-    runs: tuple[results.ScoredRun, ...]
+    runs: tuple[results.ScoredFit, ...]
     statistics: tuple[results.EntryStatistics, ...]
     certificates: tuple[results.BoxCertificate, ...]
     warnings: tuple[str, ...]
@@ -103,8 +103,7 @@ class DatasetView:
         return [
             entry
             for entry in self.statistics
-            if entry.is_best
-            or (entry.practically_equal and not (better and entry.calibrator == results.THEORETICAL_NAME))
+            if entry.is_best or (entry.practically_equal and not (better and entry.calibrator == THEORETICAL_NAME))
         ]
 
     @property
@@ -118,29 +117,29 @@ class DatasetView:
         return any(entry.practically_equal is None and entry.answers for entry in self.statistics)
 
     @property
-    def calibrated(self) -> list[tuple[results.EntryStatistics, results.ScoredRun]]:
+    def calibrated(self) -> list[tuple[results.EntryStatistics, results.ScoredFit]]:
         """Entries with an answer, and their typical run; without the design values."""
         return [
             (entry, entry.typical)
             for entry in self.statistics
-            if entry.typical is not None and entry.calibrator != results.THEORETICAL_NAME
+            if entry.typical is not None and entry.calibrator != THEORETICAL_NAME
         ]
 
     @property
-    def typical_runs(self) -> list[results.ScoredRun]:
+    def typical_runs(self) -> list[results.ScoredFit]:
         """The run of each entry with the median training cost; its first where none gave an answer."""
         first = {run.record.label: run for run in reversed(self.runs)}
         return [entry.typical or first[entry.label] for entry in self.statistics]
 
     @property
-    def reference_entry(self) -> tuple[results.EntryStatistics, results.ScoredRun] | None:
+    def reference_entry(self) -> tuple[results.EntryStatistics, results.ScoredFit] | None:
         """The entry that matrices are compared with: closed_form's, else the best calibration."""
         exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
         best = [pair for pair in self.calibrated if pair[0].is_best]
         return next(iter(exact + best + self.calibrated), None)
 
     @property
-    def published_entries(self) -> list[tuple[PublishedResult, results.EntryStatistics, results.ScoredRun]]:
+    def published_entries(self) -> list[tuple[PublishedResult, results.EntryStatistics, results.ScoredFit]]:
         """Published results whose method is an entry here that gave an answer, with that entry and its typical run."""
         answers = {entry.label: (entry, run) for entry, run in self.calibrated if run.matrix is not None}
         return [(result, *answers[result.entry]) for result in self.config.published_results if result.entry in answers]
@@ -149,7 +148,7 @@ class DatasetView:
         """The cost of the design values on a split; None where there is no run, or no such split."""
         return self.runs[0].design[split].cost if self.runs and split in self.runs[0].design else None
 
-    def errors(self, run: results.ScoredRun, split: Split) -> Array | None:
+    def errors(self, run: results.ScoredFit, split: Split) -> Array | None:
         """Final pose errors (Z, 3) of a run's answer, m, m, rad; NaN where the references do not tell them."""
         return _told(run.scores[split].errors, self.dataset.split(split)) if split in run.scores else None
 
@@ -174,7 +173,7 @@ def views(result: results.ComparisonResult) -> list[DatasetView]:
     # A style for each label; the design values have theirs
     names = {entry.label: entry.calibrator for entry in result.statistics}
     names |= {run.record.label: run.record.calibrator for run in result.runs}
-    searches = {label: name for label, name in names.items() if name != results.THEORETICAL_NAME}
+    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
     drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
     by_label = {
         label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
@@ -253,8 +252,8 @@ def rivals_in_words(view: DatasetView) -> str:
 def entry_cell(view: DatasetView, entry: results.EntryStatistics | None) -> Cell:
     """An entry's name with its colour; None stands for the design values."""
     if entry is None:
-        return Cell(results.THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
-    if entry.calibrator == results.THEORETICAL_NAME:
+        return Cell(THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
+    if entry.calibrator == THEORETICAL_NAME:
         note = "design values"
     elif entry.box == UNBOUNDED:
         note = f"{entry.parameterisation}, as given"
@@ -270,7 +269,7 @@ def on_bounds(record: results.RunRecord) -> list[str]:
 
 def cost_in_words(view: DatasetView) -> str:
     """The cost's name and its summary, and the loss, if it is a robust one."""
-    words = f"{view.config.cost.name}: {costs.entry(view.config.cost.name).summary.rstrip('.')}."
+    words = f"{view.config.cost_name}: {costs.entry(view.config.cost_name).summary.rstrip('.')}."
     if view.config.loss == "squares":
         return words
     return f"{words} It was fitted with the loss {view.config.loss}; figures here are without it."

@@ -16,15 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 import plotly.graph_objects as go
 
+from omnibench.compare import result as results
+from omnibench.compare.config import AS_RECORDED
 from omnibench.compare.report.view import interval_in_words
+from omnibench.compare.statistics import profiles, ranking
 from omnibench.report import blocks as page
 from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, seconds, significant
 from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, colours, logarithmic, plot, text, wrapped
 from omnibench.robot.kinematics import Robot
-from omnibench.study import study_result as results
-from omnibench.study.study_plan import AS_RECORDED
 from omnibench.words import plural
 
 _FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baseline", "other": ""}
@@ -34,7 +35,7 @@ _FAMILIES = {"ours": "omnibench", "published": "published", "baseline": "baselin
 class StudyView:
     """styles: of each method, the same in the whole report. methods: their names, in the config's order."""
 
-    result: results.StudyResult
+    result: results.ComparisonResult
     methods: tuple[str, ...]
     styles: Mapping[str, page.LegendItem]
 
@@ -47,11 +48,11 @@ class StudyView:
         """The robot called ``name`` as it was drawn."""
         return next(robot.dataset.robot for robot in self.result.robots if robot.name == name)
 
-    def judged(self, robot: str | None = None) -> tuple[results.StudyCell, ...]:
+    def judged(self, robot: str | None = None) -> tuple[results.Cell, ...]:
         """The cells that verdicts rest on, of one robot or of all."""
         return tuple(cell for cell in self.result.judged_cells if robot in (None, cell.key.robot))
 
-    def plain(self, robot: str) -> tuple[results.StudyCell, ...]:
+    def plain(self, robot: str) -> tuple[results.Cell, ...]:
         """The cells of a robot as recorded: judged ones, then training errors."""
         keys = [(cell, cell.key) for cell in self.result.cells]
         mine = [cell for cell, key in keys if key.robot == robot and key.regime == AS_RECORDED]
@@ -59,11 +60,11 @@ class StudyView:
 
     def family(self, method: str) -> str:
         """A method's family in a word."""
-        families = {choice.shown: choice.family for choice in self.result.config.methods}
+        families = {choice.shown: choice.family for choice in self.result.config.entries}
         return _FAMILIES[families[method]]
 
 
-def cell_words(cell: results.StudyCell) -> str:
+def cell_words(cell: results.Cell) -> str:
     """A cell within its robot: ``circular → square``."""
     return f"{cell.key.training} → {cell.key.judged}"
 
@@ -145,7 +146,7 @@ def heat_map(view: StudyView, robot: str) -> page.FigureGrid:
     return page.FigureGrid((page.Figure(title, figure, described, height, width),), (), 1, caption, f"cells-{robot}")
 
 
-def cell_table(cell: results.StudyCell, view: StudyView, judged: int) -> page.Table:
+def cell_table(cell: results.Cell, view: StudyView, judged: int) -> page.Table:
     """Every method in one cell, the least error first, those without an answer last. judged: cells of the family."""
     rows = sorted(cell.methods.values(), key=lambda each: (each.errors is None, each.mean("cost") or 0.0))
     answered = [each for each in rows if each.errors is not None]
@@ -168,7 +169,7 @@ def cell_table(cell: results.StudyCell, view: StudyView, judged: int) -> page.Ta
     )
 
 
-def _row(each: results.MethodInCell, cell: results.StudyCell, view: StudyView, judged: int, best: bool) -> page.Row:
+def _row(each: results.MethodInCell, cell: results.Cell, view: StudyView, judged: int, best: bool) -> page.Row:
     name = page.Cell(each.method, view.family(each.method))
     position, heading = each.mean("position"), each.mean("heading")
     if position is None or heading is None:
@@ -201,13 +202,13 @@ def _change(each: results.MethodInCell, robot: Robot) -> str:
     return f"matrix: {'; '.join(rows)} % of the row" if rows else ""
 
 
-def _is_for_none(cells: Sequence[results.StudyCell], method: str) -> bool:
+def _is_for_none(cells: Sequence[results.Cell], method: str) -> bool:
     """True if a method was asked in some cells and applicable in none."""
     asked = [cell.methods[method] for cell in cells if method in cell.methods]
     return bool(asked) and all(each.status == "not applicable" for each in asked)
 
 
-def _ratio(cell: results.StudyCell, method: str) -> float | None:
+def _ratio(cell: results.Cell, method: str) -> float | None:
     mean, design = cell.mean(method), float(cell.design["cost"].mean())
     return None if mean is None or design == 0 else mean / design
 
@@ -216,7 +217,7 @@ def _log(ratio: float | None) -> float | None:
     return None if ratio is None else float(np.clip(np.log2(max(ratio, 1e-9)), -_CUT, _CUT))
 
 
-def _column(cell: results.StudyCell) -> str:
+def _column(cell: results.Cell) -> str:
     return f"{cell_words(cell)}{' (training errors)' if cell.key.fitted else ''}"
 
 
@@ -240,8 +241,8 @@ def regime_section(view: StudyView) -> tuple[page.Section, ...]:
     return (page.Section("regimes", "Which method breaks where", blocks, about=about),)
 
 
-def _by_regime(view: StudyView, robot: str) -> dict[str, dict[str, results.StudyCell]]:
-    places: dict[str, dict[str, results.StudyCell]] = {}
+def _by_regime(view: StudyView, robot: str) -> dict[str, dict[str, results.Cell]]:
+    places: dict[str, dict[str, results.Cell]] = {}
     for cell in view.result.cells:
         if cell.key.robot == robot and not cell.key.fitted:
             places.setdefault(cell_words(cell), {})[cell.key.regime] = cell
@@ -284,7 +285,7 @@ def _breaking_table(view: StudyView, regimes: Sequence[str]) -> page.Table:
 
 
 def _regime_table(
-    view: StudyView, title: str, of_place: Mapping[str, results.StudyCell], regimes: Sequence[str]
+    view: StudyView, title: str, of_place: Mapping[str, results.Cell], regimes: Sequence[str]
 ) -> page.Table:
     rows = []
     for method in view.methods:
@@ -296,7 +297,7 @@ def _regime_table(
     return page.Table(title, columns, tuple(rows), "Mean final position error; small print: heading.")
 
 
-def _errors(cell: results.StudyCell | None, method: str) -> page.Cell:
+def _errors(cell: results.Cell | None, method: str) -> page.Cell:
     each = None if cell is None else cell.methods.get(method)
     position, heading = (None, None) if each is None else (each.mean("position"), each.mean("heading"))
     if each is None or position is None or heading is None:
@@ -304,12 +305,12 @@ def _errors(cell: results.StudyCell | None, method: str) -> page.Cell:
     return page.Cell(fixed(1e3 * position, 1), f"{fixed(np.degrees(heading), 2)}°")
 
 
-def _growth(of_place: Mapping[str, results.StudyCell], regime: str, method: str) -> float | None:
+def _growth(of_place: Mapping[str, results.Cell], regime: str, method: str) -> float | None:
     before, after = (of_place[name].mean(method) if name in of_place else None for name in (AS_RECORDED, regime))
     return None if not before or not after else after / before
 
 
-def _worse_than_design(of_place: Mapping[str, results.StudyCell], regime: str, method: str) -> bool:
+def _worse_than_design(of_place: Mapping[str, results.Cell], regime: str, method: str) -> bool:
     cell = of_place.get(regime)
     mean = None if cell is None else cell.mean(method)
     return cell is not None and mean is not None and mean > float(cell.design["cost"].mean()) * (1 + 1e-9)
@@ -317,7 +318,7 @@ def _worse_than_design(of_place: Mapping[str, results.StudyCell], regime: str, m
 
 def curve_section(view: StudyView) -> tuple[page.Section, ...]:
     """Learning curves; nothing where no training is on one."""
-    curves: dict[str, dict[int, results.StudyCell]] = {}
+    curves: dict[str, dict[int, results.Cell]] = {}
     for cell in view.judged():
         if match := _CURVE.match(cell.key.training):
             name = f"{cell.key.robot}: {match['kind']} → {cell.key.judged}"
@@ -335,7 +336,7 @@ def curve_section(view: StudyView) -> tuple[page.Section, ...]:
     return (page.Section("curves", "Learning curves", (grid,), about="How many runs a method needs."),)
 
 
-def _curve(view: StudyView, name: str, points: Mapping[int, results.StudyCell]) -> page.Figure:
+def _curve(view: StudyView, name: str, points: Mapping[int, results.Cell]) -> page.Figure:
     counts = sorted(points)
     traces: list[go.Scatter] = []
     least, most = [], []
@@ -373,7 +374,7 @@ def study_answer(view: StudyView) -> page.Section:
     compared = result.against_best
     cells, robots = len(view.judged()), len(view.robots)
     size = f"{plural(len(view.methods), 'method')}, {plural(robots, 'robot')}, {plural(cells, 'cell')}"
-    asked = sum(fit.result is not None for fit in result.fits)
+    asked = sum(not run.fit.refusal for run in result.runs)
     tiles = [page.Fact("Size", size, f"a cell: robot, training runs, judged kind; {plural(asked, 'fit')}")]
     if not compared or result.geometric_mean is None:
         words = f"{size}: every method was fitted to the same runs, and judged on runs that it had not seen."
@@ -468,9 +469,9 @@ def rank_section(view: StudyView) -> page.Section:
     return page.Section("ranks", "Ranks and profiles", blocks, about=about)
 
 
-def _diagram(view: StudyView, cells: Sequence[results.StudyCell], name: str) -> tuple[page.Block, ...]:
+def _diagram(view: StudyView, cells: Sequence[results.Cell], name: str) -> tuple[page.Block, ...]:
     """The critical-difference diagram of the methods that answered in every cell."""
-    ranked = results.ranking(cells, view.methods)
+    ranked = ranking(cells, view.methods)
     if ranked is None:
         return (
             page.Paragraph(
@@ -509,9 +510,9 @@ def _diagram(view: StudyView, cells: Sequence[results.StudyCell], name: str) -> 
     return (grid,)
 
 
-def _profiles(view: StudyView, cells: Sequence[results.StudyCell], name: str) -> tuple[page.Block, ...]:
+def _profiles(view: StudyView, cells: Sequence[results.Cell], name: str) -> tuple[page.Block, ...]:
     """Performance profiles of all methods with an answer."""
-    drawn = results.profiles(cells, view.methods)
+    drawn = profiles(cells, view.methods)
     if not drawn:
         return ()
     traces = []
@@ -546,10 +547,10 @@ def _profiles(view: StudyView, cells: Sequence[results.StudyCell], name: str) ->
 _SHOWN = 12  # failures that are listed; the others are counted
 
 
-def study_document(result: results.StudyResult) -> page.Document:
+def study_document(result: results.ComparisonResult) -> page.Document:
     """The report as blocks."""
     # A method has the same colour and line in the whole report
-    wanted = {choice.shown: THEORETICAL if choice.name == "theoretical" else None for choice in result.config.methods}
+    wanted = {choice.shown: THEORETICAL if choice.name == "theoretical" else None for choice in result.config.entries}
     drawn = colours(wanted)
     styles = {name: page.LegendItem(f"method-{i}", name, *drawn[name]) for i, name in enumerate(wanted)}
     view = StudyView(result, tuple(wanted), styles)
@@ -571,7 +572,7 @@ def study_document(result: results.StudyResult) -> page.Document:
     )
 
 
-def _notes(result: results.StudyResult) -> tuple[page.Section, ...]:
+def _notes(result: results.ComparisonResult) -> tuple[page.Section, ...]:
     blocks: list[page.Block] = []
     if result.config.notes:
         blocks.append(page.Callout("Notes of the config", result.config.notes))
@@ -610,24 +611,24 @@ def _method_section(view: StudyView) -> page.Section:
 
 
 def _method_row(view: StudyView, robot: str, method: str) -> page.Row | None:
-    fits = [each for each in view.result.fits if each.fit.robot.name == robot and each.fit.method.shown == method]
+    fits = [each for each in view.result.runs if each.fit.robot.name == robot and each.fit.label == method]
     if not fits:
         return None
-    outcomes = Counter(str(each.outcome) for each in fits)
-    answered = [each for each in fits if each.answered]
-    spent = sorted(each.result.seconds for each in answered if each.result is not None)
+    outcomes = Counter(str(each.result.outcome) for each in fits)
+    answered = [each for each in fits if each.errors is not None]
+    spent = sorted(each.result.seconds for each in answered)
     first = answered[0] if answered else fits[0]
     return page.Row.of(
         page.Cell(method, view.family(method)),
         count(len(fits)),
         ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items()),
         seconds(spent[len(spent) // 2] if spent and view.result.config.timing else None),
-        first.reason,
+        first.result.reason,
         role="plain" if answered else "muted",
     )
 
 
-def _data_section(result: results.StudyResult) -> page.Section:
+def _data_section(result: results.ComparisonResult) -> page.Section:
     rows = []
     for robot in result.robots:
         dataset = robot.dataset
@@ -659,7 +660,7 @@ def _data_section(result: results.StudyResult) -> page.Section:
     return page.Section("data", "Data", (table,), about="Where the recordings come from.", folded=True)
 
 
-def _reproduction(result: results.StudyResult) -> page.Section:
+def _reproduction(result: results.ComparisonResult) -> page.Section:
     config = result.config
     settings = (
         page.Fact(
