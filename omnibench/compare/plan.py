@@ -449,7 +449,7 @@ def load_robots(
     for name, source in config.datasets.items():
         dataset = source.load(name, config.description, progress)
         training_split(dataset)
-        robots.append(ComparedRobot(name, dataset, (_own_split(dataset),)))
+        robots.append(data_set(name, dataset))
     for number, (name, choice) in enumerate(config.robots.items()):
         progress(Progress("reading the recordings", number, len(config.robots), "robot", note=name))
         try:
@@ -468,13 +468,14 @@ def load_robots(
     return tuple(robots), broken
 
 
-def _own_split(dataset: Dataset) -> Training:
-    """The training of a data set: its own split."""
+def data_set(name: str, dataset: Dataset) -> ComparedRobot:
+    """A data set, divided by its own split."""
     split = {
-        name: tuple(index for index, run in enumerate(dataset.trajectories) if run.split == name) for name in SPLITS
+        part: tuple(index for index, run in enumerate(dataset.trajectories) if run.split == part) for part in SPLITS
     }
     judged = {"validation": split["validation"]} if split["validation"] else {}
-    return Training(OWN_SPLIT, (Fold("", dataset.split("train"), judged, fitted={"train": split["train"]}),))
+    fold = Fold("", dataset.split("train"), judged, fitted={"train": split["train"]})
+    return ComparedRobot(name, dataset, (Training(OWN_SPLIT, (fold,)),))
 
 
 def plan_fits(config: CompareConfig, robots: Sequence[ComparedRobot]) -> list[PlannedFit]:

@@ -115,7 +115,7 @@ def cell_ratio(errors: Array, others: Array, pairs: Pairs, cells: int) -> CellRa
     return CellRatio(
         ratio,
         _interval(ratio, parts, INTERVAL),
-        _interval(ratio, parts, 1 - (1 - INTERVAL) / cells),
+        _interval(ratio, parts, 1 - (1 - INTERVAL) / max(cells, 1)),
         unit,
         words,
     )

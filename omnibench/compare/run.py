@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -216,30 +216,48 @@ def run_comparison(
                 with resumable(fits, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                     results = execute(fits, store, progress, backend)
         with resumable(fits, store, folder):
-            scored, designs = score_fits(config, fits, results, progress)
-            runs, certificates = certify(config.certificate, scored)
-            of_datasets = [run for run in runs if run.row is not None]
-            statistics = entry_statistics(of_datasets, config.bootstrap)
-            datasets = {robot.name: robot.dataset for robot in robots if config.datasets}
-            result = ComparisonResult(
-                config=config,
-                output=folder,
-                robots=robots,
-                broken=broken,
-                runs=runs,
-                cells=make_cells(runs, designs),
-                statistics=statistics,
-                design_costs=design_costs(of_datasets, config.bootstrap),
-                certificates=certificates,
-                typical=typical_answers(of_datasets, statistics),
-                held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
-                sessions={name: _sessions_that_differ(dataset, config) for name, dataset in datasets.items()},
-                environment=environment(),
-                warnings=tuple(_warnings(config, failures, robots, runs)),
-            )
+            result = assess(config, robots, fits, results, folder, broken, failures, progress)
             write_results(result)
             write_document(comparison_document(result), folder / "report.html")
         return result
+
+
+def assess(
+    config: CompareConfig,
+    robots: Sequence[ComparedRobot],
+    fits: Sequence[PlannedFit],
+    results: Sequence[RunResult],
+    output: Path,
+    broken: Mapping[str, str] | None = None,
+    failures: Sequence[PluginFailure] = (),
+    progress: Reporter = no_progress,
+) -> ComparisonResult:
+    """The comparison of the results of all fits: scores, proofs, statistics of entries and of cells.
+
+    broken: why recordings could not be read, by robot. failures: plug-ins that could not be imported. PluginError: a
+    cost raises.
+    """
+    scored, designs = score_fits(config, fits, results, progress)
+    runs, certificates = certify(config.certificate, scored)
+    of_datasets = [run for run in runs if run.row is not None]
+    statistics = entry_statistics(of_datasets, config.bootstrap)
+    datasets = {robot.name: robot.dataset for robot in robots if config.datasets}
+    return ComparisonResult(
+        config=config,
+        output=output,
+        robots=tuple(robots),
+        broken=broken or {},
+        runs=runs,
+        cells=make_cells(runs, designs),
+        statistics=statistics,
+        design_costs=design_costs(of_datasets, config.bootstrap),
+        certificates=certificates,
+        typical=typical_answers(of_datasets, statistics),
+        held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
+        sessions={name: _sessions_that_differ(dataset, config) for name, dataset in datasets.items()},
+        environment=environment(),
+        warnings=tuple(_warnings(config, failures, robots, runs)),
+    )
 
 
 def _sessions_that_differ(dataset: Dataset, config: CompareConfig) -> tuple[str, ...]:

@@ -27,7 +27,6 @@ from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.config import read_model
 from omnibench.data.recording import RobotOption
-from omnibench.study.config import StudyConfig
 
 PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]
 BY_NAME = {topic.name: topic for topic in topics()}
@@ -164,7 +163,7 @@ def test_the_handbook_tells_of_every_public_name() -> None:
 def test_the_configs_that_are_shown_are_right() -> None:
     config, study = (block for block in blocks(BY_NAME["compare"].file) if block.startswith("name:"))
     CompareConfig.model_validate(yaml.safe_load(config))
-    StudyConfig.model_validate(yaml.safe_load(study))
+    CompareConfig.model_validate(yaml.safe_load(study))
 
 
 SHOWN = [yaml.safe_load(block[block.index("name:") :]) for block in blocks(BY_NAME["robot"].file) if "name:" in block]
@@ -212,7 +211,7 @@ def test_an_example_brings_every_file_that_its_configs_name(example: Example, tm
         if "calibrators" in content and config.name == Path(example.files[0]).name:
             assert all(folder.is_dir() for folder in read_compare_config(config).plugins)
         if "methods" in content and config.name == Path(example.files[0]).name:
-            assert all(folder.is_dir() for folder in read_model(StudyConfig, config).plugins)
+            assert all(folder.is_dir() for folder in read_model(CompareConfig, config).plugins)
             continue
         for robot in content.get("robots", ()):
             assert (config.parent / robot["calibration"]).is_file()

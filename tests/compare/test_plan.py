@@ -37,11 +37,12 @@ from omnibench.compare.config import (
     effective_config,
     load_calibrators,
     read_compare_config,
+    recording_config,
+    suitable_calibrators,
 )
 from omnibench.compare.output import prepare_output
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
-from omnibench.compare.recording_config import recording_config, suitable_calibrators
-from omnibench.compare.run import certify
+from omnibench.compare.plan import PlannedFit, load_robots, plan_fits
+from omnibench.compare.score import certify
 from omnibench.config import to_yaml
 from omnibench.errors import DataError, OmnibenchError
 from omnibench.fit.calibrate import calibrate
@@ -64,12 +65,12 @@ def box(lower: float, upper: float) -> dict[str, Any]:
     return {"lower": [[lower] * 3] * 3, "upper": [[upper] * 3] * 3}
 
 
-def planned(folder: Path, **changes: Any) -> list[PlannedRun]:
+def planned(folder: Path, **changes: Any) -> list[PlannedFit]:
     """Everything that a comparison does before it runs anything."""
     config = read_compare_config(write_config(folder, **changes))
     load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
-    return make_plan(config, load_datasets(config))
+    return plan_fits(config, load_robots(config)[0])
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_only_what_is_random_is_run_with_every_seed(tmp_path: Path) -> None:
 def test_every_data_set_is_met_by_every_calibrator(tmp_path: Path) -> None:
     sets = {name: {"simulate": flower(sample_period=period)} for name, period in (("coarse", 0.1), ("fine", 0.05))}
     runs = planned(tmp_path, datasets=sets, calibrators=["theoretical", "closed_form"])
-    labels = [(run.dataset_name, run.label) for run in runs]
+    labels = [(run.robot.name, run.label) for run in runs]
     assert labels == [(name, label) for name in sets for label in ("theoretical", "closed_form")]
 
 
@@ -210,7 +211,7 @@ SEARCHES = {"crs", "genetic", "isres", "random_search", "parametric"}
 def test_a_data_set_is_compared_by_all_calibrators_that_suit_it(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("omnibench.compare.recording_config._EVALUATIONS", 300)
+    monkeypatch.setattr("omnibench.compare.config._QUICK_EVALUATIONS", 300)
     proof = CertificateChoice(seconds=0.5)
     monkeypatch.setattr("omnibench.compare.run.certify", lambda _, *runs: certify(proof, *runs))
     printed = command("compare", prepared.data, "-o", "out")
@@ -249,7 +250,7 @@ calibrators.register("mine")(Mine)
 def test_folders_of_a_data_set_are_compared_as_one(
     command: Command, prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("omnibench.compare.recording_config.suitable_calibrators", lambda _: ["theoretical"])
+    monkeypatch.setattr("omnibench.compare.config.suitable_calibrators", lambda _: ["theoretical"])
     for day in ("day1", "day2"):
         shutil.copytree(prepared.data, day)
     by_glob = command("compare", "day*", "-o", "by_glob")
@@ -398,7 +399,7 @@ def test_the_effective_config_spells_out_every_default_and_gives_the_same_runs(r
         assert default in text
     for file in (results.parent / "small.yaml", results / "config.yaml"):
         config = effective_config(read_compare_config(file))
-        keys = {run.key for run in make_plan(config, load_datasets(config))}
+        keys = {run.key for run in plan_fits(config, load_robots(config)[0])}
         assert {f"{key}.json" for key in keys} == {file.name for file in (results / "runs").iterdir()}
 
 

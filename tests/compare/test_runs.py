@@ -49,7 +49,7 @@ from timing import PATIENCE, until
 import omnibench as installed
 from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.config import CompareConfig, effective_config, load_calibrators, read_compare_config
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan, shared_code
+from omnibench.compare.plan import PlannedFit, load_robots, plan_fits, shared_code
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError, OmnibenchError
@@ -87,12 +87,12 @@ def ran_and_kept(output: Path, config: CompareConfig | None = None, **changes: A
     return ran, kept
 
 
-def planned(**changes: Any) -> list[PlannedRun]:
+def planned(**changes: Any) -> list[PlannedFit]:
     """The runs of a small comparison."""
     config = CompareConfig.model_validate(small(**changes))
     load_calibrators(config.plugins, [entry.name for entry in config.calibrators])
     config = effective_config(config)
-    return make_plan(config, load_datasets(config))
+    return plan_fits(config, load_robots(config)[0])
 
 
 @pytest.fixture
@@ -655,7 +655,7 @@ class Spy(Calibrator):
 
 
 def test_validation_data_are_out_of_a_calibrators_reach(tmp_path: Path) -> None:
-    dataset = load_datasets(read_compare_config(write_config(tmp_path)))["flower"]
+    dataset = load_robots(read_compare_config(write_config(tmp_path)))[0][0].dataset
     save_dataset(dataset, tmp_path / "hideaway")
     needles = {
         f"{kind} {split}": array.tobytes().hex()

@@ -15,9 +15,9 @@ from report_samples import page, run, usual
 
 from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.config import Bootstrap, CertificateChoice, CompareConfig, effective_config
-from omnibench.compare.plan import PlannedRun, SearchSpace, load_datasets, make_plan
-from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredRun, SplitScore
-from omnibench.compare.run import SplitScorer, heading_error, position_error, score
+from omnibench.compare.plan import PlannedFit, load_robots, plan_fits
+from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredFit, SplitScore
+from omnibench.compare.score import SplitScorer, heading_error, position_error, score_fits
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics
 from omnibench.data.dataset import Dataset, Split, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
@@ -44,14 +44,13 @@ def records(
     **changes: Any,
 ) -> dict[str, RunRecord]:
     """Rows of entries whose answers lie a share of the way from the true matrix to the design; None: no answer."""
-    config = CompareConfig.model_validate(small(calibrators=entries, **changes))
-    datasets = load_datasets(config)
-    plan = make_plan(config, datasets)
+    config = effective_config(CompareConfig.model_validate(small(calibrators=entries, **changes)))
+    plan = plan_fits(config, load_robots(config)[0])
     results = [answer(run, share, outcome) for run, share in zip(plan, shares, strict=True)]
-    return {run.record.label: run.record for run in score(config, plan, results, datasets)}
+    return {run.record.label: run.record for run in score_fits(config, plan, results)[0]}
 
 
-def answer(run: PlannedRun, share: float | None, outcome: Outcome) -> RunResult:
+def answer(run: PlannedFit, share: float | None, outcome: Outcome) -> RunResult:
     if share is None:
         return RunResult(Outcome.FAILED, "because", None, None, None, 0, 0.0, ())
     matrix = TRUE + share * (run.dataset.robot.inverse_kinematic_matrix - TRUE)
@@ -241,15 +240,14 @@ def test_row_and_file_are_of_the_model_with_its_effects(tmp_path: Path) -> None:
 
 def test_an_effect_that_does_not_act_on_a_run_is_a_failed_row() -> None:
     config = effective_config(CompareConfig.model_validate(small(calibrators=["theoretical"])))
-    datasets = load_datasets(config)
-    (run,) = make_plan(config, datasets)
+    (run,) = plan_fits(config, load_robots(config)[0])
     result = run_calibrator(calibrators.create("theoretical"), run.problem())
     robot = run.dataset.robot
     names = [parameter.name for parameter in effects.create("wheel_eccentricity").parameters(robot)]
     term = EffectTerm(name="wheel_eccentricity", parameters=dict.fromkeys(names, 0.01))
-    bare = replace(run.dataset, trajectories=tuple(replace(each, angles=None) for each in run.training))
+    bare = replace(run.dataset, trajectories=tuple(replace(each, angles=None) for each in run.training_runs))
     extended = replace(result, extension=ModelExtension(effects=(term,)))
-    (scored,) = score(config, [replace(run, dataset=bare)], [extended], datasets | {run.dataset_name: bare})
+    (scored,), _ = score_fits(config, [replace(run, robot=replace(run.robot, dataset=bare))], [extended])
     assert scored.record.outcome == Outcome.FAILED
     assert "effect 'wheel_eccentricity' needs" in scored.record.reason
 
@@ -269,7 +267,7 @@ def scored(
     theoretical: Array | None = None,
     gap: float | None = None,
     evaluations: int = 10,
-) -> ScoredRun:
+) -> ScoredFit:
     """A run whose trajectories have these costs; None: no answer."""
     design = np.ones(8 if train is None else len(train)) if theoretical is None else theoretical
     answered = Outcome.FAILED if train is None else Outcome.CONVERGED
@@ -289,7 +287,8 @@ def scored(
     designs: dict[Split, SplitScore] = {"train": split_score(design)}
     if validation is not None:
         designs["validation"] = split_score(design)
-    return ScoredRun(record, SearchSpace("matrix", "row", bounded=True), (), scores, designs)
+    unused: Any = None  # statistics are made of the row and the scores
+    return ScoredFit(unused, unused, None, record, scores, designs)
 
 
 def split_score(costs: Array) -> SplitScore:
@@ -297,7 +296,7 @@ def split_score(costs: Array) -> SplitScore:
     return SplitScore(float(costs.mean()), costs, np.zeros((len(costs), 3)), units, SumOfNorms.rounding)
 
 
-def of(runs: list[ScoredRun], bootstrap: Bootstrap = BOOTSTRAP) -> dict[str, EntryStatistics]:
+def of(runs: list[ScoredFit], bootstrap: Bootstrap = BOOTSTRAP) -> dict[str, EntryStatistics]:
     return {entry.label: entry for entry in entry_statistics(runs, bootstrap)}
 
 

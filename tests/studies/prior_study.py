@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
+from omnibench.compare.config import CalibratorEntry, TrainingChoice, read_compare_config
+from omnibench.compare.plan import ComparedRobot, load_robots, plan_fits
+from omnibench.compare.score import score_fits
+from omnibench.compare.statistics import make_cells
 from omnibench.fit import estimate, loss
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.calibrators import map as module
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot import physical as geometry
 from omnibench.robot.kinematics import class_of
-from omnibench.study.config import MethodChoice, TrainingChoice
-from omnibench.study.study import read_study_config
-from omnibench.study.study_plan import StudiedRobot, judge_fits, load_robots, plan_fits
-from omnibench.study.study_result import make_cells
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"
 TOLERANCES: dict[str, Callable[[geometry.PhysicalTolerance, float], geometry.PhysicalTolerance]] = {
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("robots", nargs="*")
     parser.add_argument("--data", type=Path)
     given = parser.parse_args()
-    config = read_study_config(CONFIG, {} if given.data is None else {"": given.data})
+    config = read_compare_config(CONFIG, {} if given.data is None else {"": given.data})
     chosen = {name: robot for name, robot in config.robots.items() if name in (given.robots or config.robots)}
     rules = {
         name: tuple(rule for rule in robot.trainings if not rule.runs_per_command) or (TrainingChoice(by="kind"),)
@@ -64,7 +64,7 @@ def main() -> None:
         update={
             "robots": {n: robot.model_copy(update={"trainings": rules[n]}) for n, robot in chosen.items()},
             "regimes": {},
-            "methods": (MethodChoice(name="map"),),
+            "methods": (CalibratorEntry(name="map"),),
             "reference": None,
         }
     )
@@ -81,17 +81,16 @@ def main() -> None:
         print(f"{name:28s}" + "".join(f"{share:10.3f}" for share in shares), flush=True)
 
 
-def errors(config: Any, robot: StudiedRobot) -> list[float]:
+def errors(config: Any, robot: ComparedRobot) -> list[float]:
     """Mean error of each cell of a robot."""
     fits = plan_fits(config, (robot,))
     calibrator = calibrators.create("map")
-    results = {i: run_calibrator(calibrator, fit.run.problem()) for i, fit in enumerate(fits) if fit.run}
-    judged, design = judge_fits(fits, results, config.integration, lambda _: None)
+    judged, design = score_fits(config, fits, [run_calibrator(calibrator, fit.problem()) for fit in fits])
     cells = [cell for cell in make_cells(judged, design) if not cell.key.fitted]
     return [cell.methods["map"].mean("cost") or np.nan for cell in cells]
 
 
-def variants() -> Iterator[tuple[str, Callable[[StudiedRobot], Any]]]:
+def variants() -> Iterator[tuple[str, Callable[[ComparedRobot], Any]]]:
     """Every constant halved and doubled."""
     for factor in (0.5, 2.0):
         for name, change in TOLERANCES.items():
@@ -101,7 +100,7 @@ def variants() -> Iterator[tuple[str, Callable[[StudiedRobot], Any]]]:
 
 
 @contextmanager
-def _tolerance(robot: StudiedRobot, change: Callable[..., Any], factor: float) -> Iterator[None]:
+def _tolerance(robot: ComparedRobot, change: Callable[..., Any], factor: float) -> Iterator[None]:
     kind, before = class_of(robot.dataset.robot), dict(geometry._TOLERANCES)
     geometry._TOLERANCES = before | {kind: change(before[kind], factor)}  # type: ignore[misc]
     try:

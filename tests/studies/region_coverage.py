@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from omnibench.compare.plan import PlannedRun
+from omnibench.compare.config import CalibratorEntry, read_compare_config
+from omnibench.compare.plan import PlannedFit, load_robots, plan_fits
 from omnibench.fit.calibrator import run_calibrator
 from omnibench.fit.path_errors import EndErrors, calibration_covariances, error_region, slip_of
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot.calibration import Calibration, matrix_rows
-from omnibench.study.config import MethodChoice
-from omnibench.study.study import read_study_config
-from omnibench.study.study_plan import load_robots, plan_fits
 
 CONFIG = Path(__file__).parents[2] / "configs" / "real_robots.yaml"
 LEVEL = 0.95
@@ -76,15 +74,15 @@ def main(data: str | None = None) -> None:
 
 def judged_fits(data: str | None) -> Iterator[Judged]:
     """Every fit, judged on every kind of path that it was not fitted to."""
-    config = read_study_config(CONFIG, {} if data is None else {"": Path(data)})
-    methods = (MethodChoice(name="map"),)
+    config = read_compare_config(CONFIG, {} if data is None else {"": Path(data)})
+    methods = (CalibratorEntry(name="map"),)
     config = config.model_copy(update={"regimes": {}, "methods": methods, "reference": None})
     load_plugins(config.plugins)
     robots, _ = load_robots(config, lambda _: None)
     for fit in plan_fits(config, robots):
-        if fit.run is None:
+        if fit.refusal:
             continue
-        calibration = calibrated(fit.run)
+        calibration = calibrated(fit)
         for kind, indices in fit.fold.judged.items():
             if indices:
                 runs = [fit.robot.dataset.trajectories[index] for index in indices]
@@ -102,7 +100,7 @@ def judged_fits(data: str | None) -> Iterator[Judged]:
                 yield Judged(fit.robot.name, f"{fit.training.name} > {kind}", commands, sizes / radii)
 
 
-def calibrated(run: PlannedRun) -> Calibration:
+def calibrated(run: PlannedFit) -> Calibration:
     """The calibration of training runs by map, with their slip."""
     problem = run.problem()
     result = run_calibrator(calibrators.create("map"), problem)
@@ -115,7 +113,7 @@ def calibrated(run: PlannedRun) -> Calibration:
         integration=problem.integration,
         **dict(result.extension),
     )
-    return calibration.model_copy(update={"slip": slip_of(calibration, run.training)})
+    return calibration.model_copy(update={"slip": slip_of(calibration, run.training_runs)})
 
 
 def weighted(cells: list[list[Judged]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

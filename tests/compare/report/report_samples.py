@@ -8,14 +8,12 @@ from report_page import Page
 from sample_robots import APR02
 from shared_results import made_once
 
-from omnibench.compare.config import CompareConfig
-from omnibench.compare.plan import PlannedRun, load_datasets, make_plan
+from omnibench.compare.config import CompareConfig, effective_config
+from omnibench.compare.plan import PlannedFit, data_set, load_robots, plan_fits
 from omnibench.compare.report.comparison_report import comparison_document
 from omnibench.compare.result import ComparisonResult, EntryStatistics
-from omnibench.compare.run import certify, score
-from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts
+from omnibench.compare.run import assess
 from omnibench.data.dataset import Dataset
-from omnibench.environment import environment
 from omnibench.fit.calibrator import RunResult, run_calibrator
 from omnibench.registry import calibrators
 from omnibench.report.render import write_document
@@ -54,25 +52,11 @@ def config(**changes: Any) -> CompareConfig:
 
 def run(chosen: CompareConfig, datasets: Mapping[str, Dataset] | None = None) -> ComparisonResult:
     """The comparison of a config, in this process; ``datasets`` in place of the config's own."""
-    loaded = dict(datasets or load_datasets(chosen))
-    plan = make_plan(chosen, loaded)
-    scored, certificates = certify(
-        chosen.certificate, plan, score(chosen, plan, [solve(planned) for planned in plan], loaded)
-    )
-    entries = entry_statistics(scored, chosen.bootstrap)
-    return ComparisonResult(
-        config=chosen,
-        output=Path("results"),
-        datasets=loaded,
-        runs=scored,
-        statistics=entries,
-        design_costs=design_costs(scored, chosen.bootstrap),
-        certificates=certificates,
-        typical={},
-        held_out=held_out_verdicts(entries, loaded, chosen.bootstrap),
-        environment=environment(),
-        warnings=(),
-    )
+    effective = effective_config(chosen)
+    robots, _ = load_robots(effective)
+    robots = tuple(data_set(name, dataset) for name, dataset in (datasets or {}).items()) or robots
+    fits = plan_fits(effective, robots)
+    return assess(effective, robots, fits, [solve(fit) for fit in fits], Path("results"))
 
 
 @made_once
@@ -81,7 +65,7 @@ def usual() -> ComparisonResult:
     return run(config())
 
 
-def solve(planned: PlannedRun) -> RunResult:
+def solve(planned: PlannedFit) -> RunResult:
     """One planned run, in this process."""
     return run_calibrator(calibrators.create(planned.settings.calibrator, planned.settings.options), planned.problem())
 

@@ -18,7 +18,7 @@ from sample_robots import APR02, CAR, LEVER_MECANUM, TRICYCLE
 from syrupy.assertion import SnapshotAssertion
 from wheeled_samples import ROBOTS
 
-from omnibench.compare.plan import load_datasets
+from omnibench.compare.plan import load_robots
 from omnibench.compare.report.comparison_report import comparison_document, data_section, robot_section
 from omnibench.compare.report.cost_tables import ComparedFigure, compared_figures, cost_table, published_blocks
 from omnibench.compare.report.error_figures import chosen_trajectories, drawn_models
@@ -219,8 +219,8 @@ def test_one_validation_run_gives_no_interval_and_no_best(told: Render) -> None:
 
 
 def test_of_runs_whose_lengths_alone_are_known_no_heading_error_is_stated(told: Render) -> None:
-    taped = {name: replace(dataset, trajectories=tuple(map(with_a_tape, dataset.trajectories)))
-             for name, dataset in load_datasets(config()).items()}  # fmt: skip
+    (robot,), _ = load_robots(config())
+    taped = {robot.name: replace(robot.dataset, trajectories=tuple(map(with_a_tape, robot.dataset.trajectories)))}
     report = told(taped)
     answer = report.text[: report.text.index("All entries")]
     assert "closed_form misses the references by" in answer

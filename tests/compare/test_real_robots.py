@@ -7,10 +7,11 @@ from commands import CONFIGS, RECORDINGS
 from page_figures import assert_printed, chain_figures, chain_results
 from shared_results import made_once, shared_folder
 
-from omnibench.study.config import StudyConfig, TrainingChoice
-from omnibench.study.study import read_study_config, run_study, study_table
-from omnibench.study.study_plan import divide
-from omnibench.study.study_result import StudyResult
+from omnibench.compare.config import CompareConfig, TrainingChoice, read_compare_config
+from omnibench.compare.output import cell_table
+from omnibench.compare.plan import divide
+from omnibench.compare.result import ComparisonResult
+from omnibench.compare.run import run_comparison
 
 pytestmark = pytest.mark.slow
 
@@ -18,9 +19,9 @@ CONFIG = CONFIGS / "real_robots.yaml"
 METHODS = ("design", "map", "closed_form", "kallasi", "lin", "umbmark")
 
 
-def selection() -> StudyConfig:
+def selection() -> CompareConfig:
     """Two robots, whole kinds, methods that are fast."""
-    config = read_study_config(CONFIG)
+    config = read_compare_config(CONFIG)
     by_kind = (TrainingChoice(by="kind"),)
     robots = {name: config.robots[name].model_copy(update={"trainings": by_kind}) for name in ("tricyc", "omni3")}
     methods = tuple(method for method in config.methods if method.shown in METHODS)
@@ -28,16 +29,16 @@ def selection() -> StudyConfig:
 
 
 @made_once
-def studied() -> StudyResult:
+def studied() -> ComparisonResult:
     """The study of the selection."""
     if not (RECORDINGS / "optiodom").is_dir():
         pytest.skip(f"the recordings are not at {RECORDINGS}")
-    return run_study(selection(), shared_folder() / "real robots")
+    return run_comparison(selection(), shared_folder() / "real robots")
 
 
-def position(result: StudyResult, robot: str, training: str, judged: str, method: str) -> tuple[float, float]:
+def position(result: ComparisonResult, robot: str, training: str, judged: str, method: str) -> tuple[float, float]:
     """Mean final error in m and degrees."""
-    rows = study_table(result).filter(robot=robot, training=training, judged=judged, method=method)
+    rows = cell_table(result).filter(robot=robot, training=training, judged=judged, method=method)
     (row,) = rows.to_dicts()
     return row["position_m"], row["heading_deg"]
 
@@ -75,7 +76,7 @@ def test_a_lost_wheel_rate_explains_the_squares_of_the_omni_robot() -> None:
 
 
 def test_every_robot_of_the_config_is_divided_as_it_says() -> None:
-    config = read_study_config(CONFIG)
+    config = read_compare_config(CONFIG)
     for name in ("diff", "omni4", "corelli"):
         choice = config.robots[name]
         source = choice.source(config.data, name)

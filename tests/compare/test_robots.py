@@ -12,20 +12,13 @@ from commands import Command, refused, run_here, summary, write_plugin
 from sample_robots import DIFFERENTIAL
 from studied import robot_dataset, write_study
 
+from omnibench.compare.config import RegimeChoice, RobotChoice, TrainingChoice
+from omnibench.compare.plan import Training, divide, in_regime
+from omnibench.compare.ratios import Pairs, cell_ratio
+from omnibench.compare.result import MEASURES, Cell, CellKey, MethodInCell
+from omnibench.compare.statistics import profiles, ranking
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import DataError, OmnibenchError
-from omnibench.study.config import RegimeChoice, RobotChoice, TrainingChoice
-from omnibench.study.study_plan import Training, divide, in_regime
-from omnibench.study.study_result import (
-    MEASURES,
-    CellKey,
-    MethodInCell,
-    Pairs,
-    StudyCell,
-    cell_ratio,
-    profiles,
-    ranking,
-)
 
 METHOD = """
 @calibrators.register("{name}")
@@ -156,7 +149,7 @@ def test_run_again_nothing_is_fitted_twice_and_the_table_is_the_same(studied: St
         ({"reference": "deafult"}, "reference: 'deafult'"),
         ({"data": "nowhere"}, "nowhere"),
         ({"trainings": ["kinds"]}, "trainings.0.by"),
-        ({"seeds": [-1]}, "seeds.0"),
+        ({"seeds": [-1]}, "seeds"),
         ({"backend": "dusk"}, "'dusk' 'dask'"),
         ({"regimes": {"as recorded": {"noise_position": 1}}}, "'as recorded'"),
         ({"methods": [{"name": "closed_form", "trainings": "lime"}], "reference": None}, "'line'"),
@@ -377,7 +370,7 @@ def test_fewer_runs_are_the_first_of_each_command(runs: tuple[Trajectory, ...]) 
 # Intervals of ratios of errors, ranks, critical differences and performance profiles.
 
 
-def cell(**errors: float | None) -> StudyCell:
+def cell(**errors: float | None) -> Cell:
     """A cell in which each method has one error; None: no answer."""
 
     def of(value: float) -> dict[str, np.ndarray]:
@@ -390,7 +383,7 @@ def cell(**errors: float | None) -> StudyCell:
         for name, value in errors.items()
     }
     pairs = Pairs(np.zeros(1, dtype=int), np.zeros(1, dtype=int), (None,), (None,))
-    return StudyCell(CellKey("robot", "a", "as recorded", "b", False), pairs, of(1.0), methods)  # type: ignore[arg-type]
+    return Cell(CellKey("robot", "a", "as recorded", "b", False), pairs, of(1.0), methods)  # type: ignore[arg-type]
 
 
 def test_the_critical_difference_is_that_of_demsars_tables() -> None:
