@@ -10,7 +10,7 @@ import typer
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.options import argument, option, output_option
+from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -45,6 +45,7 @@ def compare(
         workers=option("Processes, or Dask workers started here. Default: the config's.", min=1)
     ),
     figures: Path | None = shared.FIGURES,
+    everything: bool = flag("Print all tables of the report, not the answer alone.", "--all"),
     force: bool = shared.FORCE,
     plugins: list[Path] | None = option(
         "Folder of plug-ins besides the config's; may be repeated.", "--plugins", metavar="DIR"
@@ -57,7 +58,7 @@ def compare(
     where it was stopped.
     """
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
-    from omnibench.compare.report.comparison_report import comparison_document
+    from omnibench.compare.report.document import comparison_document
 
     shared.refuse_figures_without_browser(figures)
     asked = shared.plugin_folders(plugins or [])
@@ -73,7 +74,7 @@ def compare(
             watch(Progress("drawing the figures"))
             shared.write_asked_figures(comparison_document(result), figures)
     warn(result.warnings)
-    print_result(make_console(), result)
+    print_result(make_console(), result, everything=everything)
     for name, entry in result.held_out.items():
         print_verdict(entry.verdict, f"{name}, {entry.label}: ", result.sessions.get(name, ()))
     typer.echo(f"report: {result.output / 'report.html'}")

@@ -1,30 +1,32 @@
-"""The report's view of one data set: its results, how entries are drawn, and how its numbers are said."""
+"""The results on one data set as they are shown: what is best, how entries are drawn, and how its numbers are said."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from omnibench.compare import result as results
 from omnibench.compare.config import THEORETICAL_NAME, CompareConfig, PublishedResult
 from omnibench.compare.plan import UNBOUNDED
-from omnibench.data.dataset import SPLITS, Dataset, Split, Trajectory
+from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.intervals import Clusters, Interval, units_of
 from omnibench.fit.reference_rows import measured_parts
-from omnibench.registry import calibrators, costs
+from omnibench.registry import calibrators
 from omnibench.report.blocks import Cell, LegendItem
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, percent, seconds, significant, span
-from omnibench.report.style import REFERENCE, SYMBOLS, THEORETICAL, colours
+from omnibench.report.style import SYMBOLS, THEORETICAL, colours
 from omnibench.robot.calibration import ModelExtension, extended_model
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 SPLIT_NAMES: Mapping[Split, str] = {"train": "training", "validation": "held-out"}
-
+NO_INTERVAL = "no interval"
+THEORETICAL_STYLE = LegendItem("theoretical", "design values", THEORETICAL, "dash")
 # Colours by calibrator. The paper draws its non-parametric (genetic) result in magenta, the parametric one in brown.
 _CUSTOMARY = {
     "closed_form": "#0072b2",
@@ -36,33 +38,59 @@ _CUSTOMARY = {
 }
 
 
-REFERENCE_STYLE = LegendItem("reference", "reference", REFERENCE)
-THEORETICAL_STYLE = LegendItem("theoretical", "design values", THEORETICAL, "dash")
-
-
 @dataclass(frozen=True, eq=False)
 class DatasetView:
-    """One data set of the comparison.
+    """One data set of a comparison. styles: by label, the same in the whole report."""
 
-    warnings: warnings of the whole comparison. styles: styles by label, the same in the whole report. design_costs:
-    mean cost of the design values on each split that has trajectories. design_errors: final pose errors (Z, 3) of the
-    design matrix on each such split, m, m, rad. units: what the intervals of each such split rest on. held_out: what
-    held-out runs say of the best calibration, if there is one. sessions: sentences on those that differ.
-    """
-
+    result: results.ComparisonResult
     name: str
-    config: CompareConfig
-    dataset: Dataset
-    runs: tuple[results.ScoredFit, ...]
-    statistics: tuple[results.EntryStatistics, ...]
-    certificates: tuple[results.BoxCertificate, ...]
-    warnings: tuple[str, ...]
     styles: Mapping[str, LegendItem]
-    design_costs: Mapping[Split, Interval]
-    design_errors: Mapping[Split, Array]
-    units: Mapping[Split, Clusters]
-    held_out: results.EntryVerdict | None
-    sessions: tuple[str, ...]
+
+    @property
+    def config(self) -> CompareConfig:
+        """The effective config."""
+        return self.result.config
+
+    @property
+    def dataset(self) -> Dataset:
+        """The data set."""
+        return self.result.datasets[self.name]
+
+    @cached_property
+    def runs(self) -> tuple[results.ScoredFit, ...]:
+        """All fits to it."""
+        return tuple(run for run in self.result.runs if run.record.dataset == self.name)
+
+    @cached_property
+    def statistics(self) -> tuple[results.EntryStatistics, ...]:
+        """The statistics of its entries."""
+        return tuple(entry for entry in self.result.statistics if entry.dataset == self.name)
+
+    @property
+    def certificates(self) -> tuple[results.BoxCertificate, ...]:
+        """What is proven of its boxes."""
+        return tuple(each for each in self.result.certificates if each.dataset == self.name)
+
+    @property
+    def held_out(self) -> results.EntryVerdict | None:
+        """What held-out runs say of the best calibration, if there is one."""
+        return self.result.held_out.get(self.name)
+
+    @property
+    def design_costs(self) -> Mapping[Split, Interval]:
+        """The mean cost of the design values on each split that has trajectories."""
+        return self.result.design_costs.get(self.name, {})
+
+    @cached_property
+    def design_errors(self) -> Mapping[Split, Array]:
+        """Final pose errors (Z, 3) of the design matrix on each split that has trajectories, m, m, rad."""
+        design = OdometryModel.of_design(self.dataset.robot, self.config.integration)
+        splits = [split for split in SPLITS if self.dataset.split(split)]
+        return {split: self._told(final_errors(design, self.dataset.split(split)), split) for split in splits}
+
+    def units(self, split: Split) -> Clusters:
+        """The draws that a split's intervals rest on."""
+        return units_of(self.dataset.split(split), self.config.bootstrap.unit)
 
     @property
     def times_compare(self) -> bool:
@@ -93,17 +121,17 @@ class DatasetView:
         return next((entry for entry in self.statistics if entry.is_best and entry.typical is not None), None)
 
     @property
-    def not_told_apart(self) -> list[results.EntryStatistics]:
-        """Entries whose difference from the best may be chance, itself among them.
+    def rivals(self) -> list[results.EntryStatistics]:
+        """Entries whose difference from the best may be chance.
 
-        The design values are not, where the best one's improvement on them is more than chance.
+        The design values are none, where the best one's improvement on them is more than chance.
         """
         gained = None if self.best is None else self.best.improvement(self.scored)
         better = gained is not None and gained.known is not None and not gained.holds(0.0)
         return [
             entry
             for entry in self.statistics
-            if entry.is_best or (entry.practically_equal and not (better and entry.calibrator == THEORETICAL_NAME))
+            if entry.practically_equal and not entry.is_best and not (better and entry.calibrator == THEORETICAL_NAME)
         ]
 
     @property
@@ -126,17 +154,11 @@ class DatasetView:
         ]
 
     @property
-    def typical_runs(self) -> list[results.ScoredFit]:
-        """The run of each entry with the median training cost; its first where none gave an answer."""
-        first = {run.record.label: run for run in reversed(self.runs)}
-        return [entry.typical or first[entry.label] for entry in self.statistics]
-
-    @property
-    def reference_entry(self) -> tuple[results.EntryStatistics, results.ScoredFit] | None:
+    def reference_entry(self) -> results.EntryStatistics | None:
         """The entry that matrices are compared with: closed_form's, else the best calibration."""
-        exact = [pair for pair in self.calibrated if calibrators.entry(pair[0].calibrator).cls.exact]
-        best = [pair for pair in self.calibrated if pair[0].is_best]
-        return next(iter(exact + best + self.calibrated), None)
+        entries = [entry for entry, _ in self.calibrated]
+        exact = [entry for entry in entries if calibrators.entry(entry.calibrator).cls.exact]
+        return next(iter([*exact, *(entry for entry in entries if entry.is_best), *entries]), None)
 
     @property
     def published_entries(self) -> list[tuple[PublishedResult, results.EntryStatistics, results.ScoredFit]]:
@@ -150,7 +172,13 @@ class DatasetView:
 
     def errors(self, run: results.ScoredFit, split: Split) -> Array | None:
         """Final pose errors (Z, 3) of a run's answer, m, m, rad; NaN where the references do not tell them."""
-        return _told(run.scores[split].errors, self.dataset.split(split)) if split in run.scores else None
+        return self._told(run.scores[split].errors, split) if split in run.scores else None
+
+    def _told(self, errors: Array, split: Split) -> Array:
+        """Final errors (Z, 3), NaN where a run's references tell no lengths or no angles."""
+        placed, turned = measured_parts(self.dataset.split(split))
+        told: Array = np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
+        return told
 
     @property
     def without_poses(self) -> bool:
@@ -167,118 +195,69 @@ class DatasetView:
         """The design matrix (3, M)."""
         return self.dataset.robot.inverse_kinematic_matrix
 
+    @property
+    def cost_decimals(self) -> int:
+        """Decimals of costs: four as in the paper, more where that leaves the lowest too few digits."""
+        values = [of_split.cost.value for entry in self.statistics for of_split in entry.splits.values()]
+        return min(7, max(4, decimals_for(min(values, default=None), 3)))
+
+    def entry_cell(self, entry: results.EntryStatistics | None) -> Cell:
+        """An entry's name with its colour; None stands for the design values."""
+        if entry is None or entry.calibrator == THEORETICAL_NAME:
+            label = THEORETICAL_NAME if entry is None else entry.label
+            return Cell(label, "design values", THEORETICAL_STYLE.colour)
+        note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
+        if entry.box == UNBOUNDED:
+            note = f"{entry.parameterisation}, as given"
+        return Cell(entry.label, note, self.styles[entry.label].colour)
+
 
 def views(result: results.ComparisonResult) -> list[DatasetView]:
     """The data sets of a comparison, in the config's order."""
-    # A style for each label; the design values have theirs
-    names = {entry.label: entry.calibrator for entry in result.statistics}
-    names |= {run.record.label: run.record.calibrator for run in result.runs}
-    searches = {label: name for label, name in names.items() if name != THEORETICAL_NAME}
-    drawn = colours({label: _CUSTOMARY.get(name) for label, name in searches.items()})
+    names = {run.record.label: run.record.calibrator for run in result.runs}
+    names |= {entry.label: entry.calibrator for entry in result.statistics}
+    drawn = colours({label: _CUSTOMARY.get(name) for label, name in names.items() if name != THEORETICAL_NAME})
     by_label = {
         label: LegendItem(f"entry-{index}", label, colour, dash, SYMBOLS[index % len(SYMBOLS)])
         for index, (label, (colour, dash)) in enumerate(drawn.items())
     }
     styles = {label: by_label.get(label, THEORETICAL_STYLE) for label in names}
-    return [_view(result, name, styles) for name in result.datasets]
+    return [DatasetView(result, name, styles) for name in result.datasets]
 
 
-def _view(result: results.ComparisonResult, name: str, styles: Mapping[str, LegendItem]) -> DatasetView:
-    dataset = result.datasets[name]
-    design = OdometryModel.of_design(dataset.robot, result.config.integration)
-    return DatasetView(
-        name=name,
-        config=result.config,
-        dataset=dataset,
-        runs=tuple(run for run in result.runs if run.record.dataset == name),
-        statistics=tuple(entry for entry in result.statistics if entry.dataset == name),
-        certificates=tuple(certificate for certificate in result.certificates if certificate.dataset == name),
-        warnings=result.warnings,
-        styles=styles,
-        design_costs=result.design_costs.get(name, {}),
-        design_errors={
-            split: _told(final_errors(design, dataset.split(split)), dataset.split(split))
-            for split in SPLITS
-            if dataset.split(split)
-        },
-        units={
-            split: units_of(dataset.split(split), result.config.bootstrap.unit)
-            for split in SPLITS
-            if dataset.split(split)
-        },
-        held_out=result.held_out.get(name),
-        sessions=result.sessions.get(name, ()),
-    )
-
-
-def _told(errors: Array, runs: Sequence[Trajectory]) -> Array:
-    """Final errors (Z, 3), NaN for positions and for headings of runs whose references tell no lengths or no angles."""
-    placed, turned = measured_parts(runs)
-    told: Array = np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
-    return told
-
-
-NO_INTERVAL = "no interval"
-
-
-def improvement_in_words(entry: results.EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
+def improvement_cells(entry: results.EntryStatistics, split: Split, decimals: int) -> tuple[str, str]:
     """An entry's improvement on a split and its interval, in per cent."""
     share = entry.improvement(split)
     if share is None:
         return NOTHING, ""
-    if share.known is None:
-        return percent(share.value, decimals), NO_INTERVAL
-    return percent(share.value, decimals), f"{span(100 * share.known[0], 100 * share.known[1], 1)} %"
+    known = share.known
+    interval = NO_INTERVAL if known is None else f"{span(100 * known[0], 100 * known[1], 1)} %"
+    return percent(share.value, decimals), interval
 
 
-def interval_basis(view: DatasetView, split: Split) -> str:
-    """The basis of a split's intervals, in words: ``bootstrap over 36 commands``."""
-    return view.units[split].ratio_words
-
-
-def interval_in_words(interval: Interval | None, decimals: int) -> str:
+def interval_cell(interval: Interval | None, decimals: int) -> str:
     """An interval; empty where there is no value."""
     if interval is None:
         return ""
     return NO_INTERVAL if interval.known is None else span(*interval.known, decimals)
 
 
-def rivals_in_words(view: DatasetView) -> str:
-    """Number of entries that are not told apart from the best, in words; empty where there are none."""
-    others = len(view.not_told_apart) - 1
-    return f"not told apart from {plural(others, 'other')}" if others > 0 else ""
-
-
-def entry_cell(view: DatasetView, entry: results.EntryStatistics | None) -> Cell:
-    """An entry's name with its colour; None stands for the design values."""
-    if entry is None:
-        return Cell(THEORETICAL_NAME, "design values", THEORETICAL_STYLE.colour)
-    if entry.calibrator == THEORETICAL_NAME:
-        note = "design values"
-    elif entry.box == UNBOUNDED:
-        note = f"{entry.parameterisation}, as given"
+def difference_cells(difference: Interval) -> tuple[str, str]:
+    """A difference and its interval, with decimals that show two digits of the larger end."""
+    low, high = difference.known or (difference.value, difference.value)
+    largest = max(abs(low), abs(high))
+    if 0 < largest < 1e-5:
+        value, *ends = (significant(each, 2, signed=True) for each in (difference.value, low, high))
+        between = " to ".join(ends)
     else:
-        note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
-    return Cell(entry.label, note, view.styles[entry.label].colour)
+        digits = max(4, decimals_for(largest, 2))
+        value, between = fixed(difference.value, digits, signed=True), span(low, high, digits, signed=True)
+    return value, NO_INTERVAL if difference.known is None else between
 
 
-def on_bounds(record: results.RunRecord) -> list[str]:
-    """Elements that the search moved to a bound; not those that the box holds at their start value."""
-    return [name for name in record.at_bounds if name not in record.held]
-
-
-def cost_in_words(view: DatasetView) -> str:
-    """The cost's name and its summary, and the loss, if it is a robust one."""
-    words = f"{view.config.cost_name}: {costs.entry(view.config.cost_name).summary.rstrip('.')}."
-    if view.config.loss == "squares":
-        return words
-    return f"{words} It was fitted with the loss {view.config.loss}; figures here are without it."
-
-
-def cost_decimals(view: DatasetView) -> int:
-    """Decimals of a data set's costs: four as in the paper, more where that leaves the lowest too few digits."""
-    values = [of_split.cost.value for entry in view.statistics for of_split in entry.splits.values()]
-    return min(7, max(4, decimals_for(min(values, default=None), 3)))
+def rivals_cell(view: DatasetView) -> str:
+    """The number of entries that are not told apart from the best; empty where there are none."""
+    return f"not told apart from {plural(len(view.rivals), 'other')}" if view.rivals else ""
 
 
 def position_unit(*errors: float) -> tuple[float, str, int]:
@@ -290,16 +269,3 @@ def mean_and_worst(values: Array) -> tuple[float, float]:
     """Mean and largest of the values (n,) that are known; NaN where none is."""
     known = values[np.isfinite(values)]
     return (float(known.mean()), float(known.max())) if len(known) else (np.nan, np.nan)
-
-
-def difference_in_words(difference: Interval) -> tuple[str, str]:
-    """A difference and its interval, with decimals that show two digits of the larger end."""
-    low, high = difference.known or (difference.value, difference.value)
-    largest = max(abs(low), abs(high))
-    if 0 < largest < 1e-5:
-        value, *ends = (significant(each, 2, signed=True) for each in (difference.value, low, high))
-        between = " to ".join(ends)
-    else:
-        digits = max(4, decimals_for(largest, 2))
-        value, between = fixed(difference.value, digits, signed=True), span(low, high, digits, signed=True)
-    return value, NO_INTERVAL if difference.known is None else between
