@@ -550,7 +550,7 @@ def comparison(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
     entries = [*WELL_BEHAVED, *request.param]
     limits = {"budget": {"evaluations": 500, "seconds": 5}, "memory_mb": 1000, "workers": 4}
     config = write_config(folder, plugins=["plugins"], calibrators=entries, **limits)
-    run = run_here("compare", config, "--output", folder / "out", cwd=folder)
+    run = run_here("compare", config, "--output", folder / "out", "--all", cwd=folder)
     assert run.returncode == 0
     return Compared(folder / "out", run, rows(folder / "out"), WELL_BEHAVED | request.param)
 
@@ -778,15 +778,17 @@ def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference() -> 
         assert 0 < run["reference_seconds"] < 1
         assert run["machine"]
     first, *rest = result.runs
-    other = replace(first, record=first.record.model_copy(update={"machine": "another"}))
-    printed = " ".join(on_terminal(print_result, replace(result, runs=(other, *rest)), width=200).split())
+    other = replace(first, row=first.record.model_copy(update={"machine": "another"}))
+    printed = " ".join(
+        on_terminal(print_result, replace(result, runs=(other, *rest)), width=200, everything=True).split()
+    )
     assert "of the start)" in printed
-    assert "since the machines differ" in printed
+    assert "on machines of different speed" in printed
 
 
 def test_runs_that_are_not_timed_show_no_seconds(tmp_path: Path) -> None:
     result = compared_here(tmp_path, timing=False, calibrators=["theoretical"])
     assert {run["reference_seconds"] for run in summary(tmp_path)["runs"]} == {None}
-    printed = " ".join(on_terminal(print_result, result, width=200).split())
+    printed = " ".join(on_terminal(print_result, result, width=200, everything=True).split())
     assert "The runs were not timed." in printed
     assert " ms)" not in printed

@@ -83,7 +83,8 @@ def answer_sentence(view: views.DatasetView) -> str:
     if not view.rivals:
         return f"{words}. {best.label} is best."
     rivals = ["the design values" if e.calibrator == THEORETICAL_NAME else e.label for e in view.rivals]
-    return f"{words}. Not told apart from it: {listing(rivals, 20)}; it has the lowest training cost of these."
+    named = listing(rivals, 3) if len(rivals) <= 3 else f"{len(rivals)} other entries"
+    return f"{words}. Not told apart from it: {named}; it has the lowest training cost of these."
 
 
 def _changes(view: views.DatasetView, best: EntryStatistics) -> Iterator[tuple[str, str, str]]:
@@ -108,7 +109,8 @@ def _tiles(view: views.DatasetView) -> Iterator[blocks.Fact]:
         name = f"Final {kind} error, mean"
         if view.without_poses:
             name = f"Error of {'angles' if kind == 'heading' else 'lengths and places'}, mean"
-        yield blocks.Fact(name, f"{old} → {new}", f"worst {worst}")
+        before = old if kind == "heading" else old.rpartition(" ")[0]
+        yield blocks.Fact(name, f"{before} → {new}", f"worst {worst}")
     reached = best.cost(split)
     if reached is not None:
         change = f"{fixed(view.theoretical_cost(split), decimals)} → {fixed(reached.value, decimals)}"

@@ -14,6 +14,7 @@ from omnibench.compare.report import view as views
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
+from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import START, coordinates, marks, path
 from omnibench.report.numbers import (
@@ -35,6 +36,7 @@ from omnibench.report.style import plan, plot, text
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
+_MET = 1e-4  # share of the lowest cost: searches that end nearer to it are in one minimum (chosen)
 _PUBLISHED_COST = "final_pose"  # published costs are those of Eq. (6)
 _DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
 _TURN_RATE = 0.35  # rad/s
@@ -51,9 +53,51 @@ def published_blocks(view: views.DatasetView) -> Iterator[Block]:
         yield _figure_table(view)
         yield _circumstance_table(view)
         yield from _effort_table(view)
+        if lines := _claims(view):
+            yield Callout("What the paper claims, and what is seen here", lines)
         remarks = tuple(dict.fromkeys(remark for result in published for remark in result.remarks))
         if remarks:
             yield Callout("About the published figures", remarks)
+
+
+def _claims(view: views.DatasetView) -> tuple[str, ...]:
+    """Two claims of the paper: curves show systematic errors best, and a genetic algorithm avoids local minima."""
+    lines, split, turns = [], view.scored, [run.omega for run in view.dataset.split(view.scored)]
+    turning = np.array([bool(turn) for turn in turns])
+    if view.runs and None not in turns and 0 < turning.sum() < len(turning):
+        costs = view.runs[0].design[split].costs
+        curved, straight = float(costs[turning].mean()), float(costs[~turning].mean())
+        seen = "so here" if curved > straight else "not here"
+        lines.append(
+            f"Curves show systematic errors best (section 4.1): {seen}, Eq. (6) of the design values is "
+            f"{fixed(curved, 3)} on the {views.SPLIT_NAMES[split]} runs in curves and {fixed(straight, 3)} on straight "
+            "ones."
+        )
+    genetic = next((run for _, entry, run in view.published_entries if entry.parameterisation == "matrix"), None)
+    costs_of: dict[str, list[float]] = {}
+    for run in view.runs:
+        record = run.record
+        rival = (
+            genetic is not None and record.label != genetic.record.label and run.search_space == genetic.search_space
+        )
+        if rival and calibrators.entry(record.calibrator).cls.stochastic and record.train_cost is not None:
+            costs_of.setdefault(record.label, []).append(record.train_cost)
+    if genetic is not None and costs_of:
+        box, lowest = genetic.record.box, min(min(costs) for costs in costs_of.values())
+        met = [
+            f"{sum(cost <= (1 + _MET) * lowest for cost in costs)} of {plural(len(costs), 'run')} of {label}"
+            for label, costs in costs_of.items()
+        ]
+        proven = [
+            f"; by proof no matrix of the box is more than {percent(certificate.gap, 2)} below it"
+            for certificate in view.certificates
+            if certificate.box == box
+        ]
+        lines.append(
+            f"Local minima (section 5): from random starts in the box {box}, {listing(met)} ended within "
+            f"{percent(_MET, 2)} of one cost, {fixed(lowest, view.cost_decimals)}{''.join(proven)}."
+        )
+    return tuple(lines)
 
 
 @dataclass(frozen=True)

@@ -151,11 +151,9 @@ def entry_table(view: views.DatasetView) -> Table:
                 role="best" if entry.is_best else "plain" if entry.answers else "failed",
             )
         )
-    machines = (
-        ""
-        if view.times_compare or not view.config.timing
-        else (" Runs were made on machines of different speed, so times are in evaluations of the start's cost there.")
-    )
+    untimed = "" if view.config.timing else " The runs were not timed."
+    if view.config.timing and not view.times_compare:
+        untimed = " Runs were made on machines of different speed: times are in evaluations of the start's cost there."
     return Table(
         "Entries over their seeds",
         (
@@ -173,7 +171,7 @@ def entry_table(view: views.DatasetView) -> Table:
         f"Difference: paired by {view.units(split).name}, with its 95 % interval, {view.units(split).ratio_words}. Not "
         "told apart: it contains zero, or the difference is below a tenth of the standard error of the best entry's "
         "cost. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
-        f"{views.SPLIT_NAMES[split]} cost.{_held(view)}{machines}",
+        f"{views.SPLIT_NAMES[split]} cost.{_held(view)}{untimed}",
     )
 
 

@@ -10,7 +10,7 @@ from shared_results import made_once
 
 from omnibench.compare.config import CompareConfig, effective_config
 from omnibench.compare.plan import PlannedFit, data_set, load_robots, plan_fits
-from omnibench.compare.report.comparison_report import comparison_document
+from omnibench.compare.report.document import comparison_document
 from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.compare.run import assess
 from omnibench.data.dataset import Dataset
