@@ -237,7 +237,7 @@ def assess(
     broken: why recordings could not be read, by robot. failures: plug-ins that could not be imported. PluginError: a
     cost raises.
     """
-    scored, designs = score_fits(config, fits, results, progress)
+    scored, designs = score_fits(config, fits, results, progress if config.robots else no_progress)
     runs, certificates = certify(config.certificate, scored)
     of_datasets = [run for run in runs if run.row is not None]
     statistics = entry_statistics(of_datasets, config.bootstrap)

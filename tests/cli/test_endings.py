@@ -179,6 +179,6 @@ def test_one_run_is_not_said_to_be_several(command: Command, tmp_path: Path) -> 
         tmp_path, datasets={"flower": {"simulate": flower(commands=motion)}}, calibrators=["theoretical"]
     )
     compared = command("compare", config, "-o", tmp_path / "out")
-    assert "\nCost of 1 training run\n" in compared.stdout
+    assert "flower (simulated): 1 held-out run, cost" in compared.stdout
     assert ", 1 evaluation, " in compared.stderr
     assert command("simulate", config, "-o", tmp_path / "data").stdout.startswith("2 simulated trajectories: ")

@@ -146,7 +146,6 @@ BELOW = {
     "check": {"robot", "data", "fit"},
     "design": {"robot", "data", "slam", "simulate", "fit", "report"},
     "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
-    "study": {"robot", "data", "slam", "simulate", "fit", "report", "compare"},
     "discover": {"robot", "data", "simulate", "fit", "report"},
     "live": {"robot", "data", "simulate"},
     "testing": {"robot", "data", "fit"},

@@ -48,10 +48,10 @@ def answer_table(view: views.DatasetView) -> Table:
         (
             Column("Entry", numeric=False),
             Column("Cost"),
-            Column("95 % interval", priority=1),
+            Column("95 % interval", priority=3),
             Column("Improvement"),
-            Column("Position", "mm"),
-            Column("Heading", "°"),
+            Column("Position", "mm", priority=1),
+            Column("Heading", "°", priority=2),
             Column("Verdict", numeric=False),
         ),
         tuple(rows),
