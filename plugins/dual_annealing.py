@@ -1,0 +1,18 @@
+"""SciPy's dual annealing: Xiang et al., Physics Letters A 233:216 (1997)."""
+
+from scipy.optimize import dual_annealing
+
+from omnibench.fit.library_search import LibrarySearch
+from omnibench.registry import calibrators
+
+
+@calibrators.register("dual_annealing")
+class DualAnnealing(LibrarySearch):
+    """Generalised simulated annealing with a local search, by SciPy."""
+
+    package = "scipy"
+
+    def search(self, cost, start, rng):
+        """SciPy calls a function of one point."""
+        box = [(0.0, 1.0)] * len(start)
+        return dual_annealing(lambda point: float(cost(point)[0]), box, x0=start, rng=rng).message[0]
