@@ -237,6 +237,8 @@ def _files_in(folder: Path) -> list[Path]:
     """The plug-in files of a folder; of one that another machine has, those that it sent."""
     if copied := [path for path in _copies if path.parent in (folder, folder.resolve())]:
         return sorted(copied)
+    if folder.suffix == ".py" and (folder.is_file() or folder in _copies):  # one that a comparison adds
+        return [folder]
     if folder.is_file():
         raise PluginError(f"plug-in folder {folder} is a file; name the folder that it lies in with --plugins")
     if not folder.is_dir():

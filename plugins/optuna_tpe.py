@@ -1,7 +1,11 @@
 """Optuna's tree-structured Parzen estimator: Bergstra et al., NeurIPS 24:2546 (2011)."""
 
-from omnibench.fit.library_search import LibrarySearch
+import numpy as np
+from numpy.random import Generator
+
+from omnibench.fit.library_search import LibrarySearch, UnitCost
 from omnibench.registry import calibrators
+from omnibench.robot.kinematics import Array
 
 
 @calibrators.register("optuna_tpe")
@@ -10,7 +14,7 @@ class OptunaTpe(LibrarySearch):
 
     package = "optuna"
 
-    def search(self, cost, start, rng):
+    def search(self, cost: UnitCost, start: Array, rng: Generator) -> str:
         """Optuna is asked and told."""
         import optuna
 
@@ -18,5 +22,6 @@ class OptunaTpe(LibrarySearch):
         study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=int(rng.integers(2**31))))
         for _ in range(500):
             trial = study.ask()
-            study.tell(trial, float(cost([trial.suggest_float(str(i), 0, 1) for i in range(len(start))])[0]))
+            point = np.array([trial.suggest_float(str(number), 0, 1) for number in range(len(start))])
+            study.tell(trial, float(cost(point)[0]))
         return "500 evaluations"

@@ -1,7 +1,10 @@
 """Particle swarm optimisation by pymoo: Kennedy and Eberhart, Proc. ICNN 4:1942 (1995)."""
 
-from omnibench.fit.library_search import LibrarySearch
+from numpy.random import Generator
+
+from omnibench.fit.library_search import LibrarySearch, UnitCost
 from omnibench.registry import calibrators
+from omnibench.robot.kinematics import Array
 
 
 @calibrators.register("pymoo_pso")
@@ -10,7 +13,7 @@ class PymooPso(LibrarySearch):
 
     package = "pymoo"
 
-    def search(self, cost, start, rng):
+    def search(self, cost: UnitCost, start: Array, rng: Generator) -> str:
         """Pymoo calls a function of whole generations."""
         from pymoo.algorithms.soo.nonconvex.pso import PSO
         from pymoo.optimize import minimize

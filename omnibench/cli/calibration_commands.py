@@ -46,6 +46,12 @@ def compare(
     ),
     figures: Path | None = shared.FIGURES,
     everything: bool = flag("Print all tables of the report, not the answer alone.", "--all"),
+    added: list[Path] | None = option(
+        "Plug-in file whose calibrators are compared, too; the fits of all others are kept for the next one.",
+        "--add",
+        metavar="FILE.py",
+    ),
+    traces: Path | None = option("Write the courses of all searches, for IOHinspector.", metavar="DIR"),
     force: bool = shared.FORCE,
     plugins: list[Path] | None = option(
         "Folder of plug-ins besides the config's; may be repeated.", "--plugins", metavar="DIR"
@@ -57,8 +63,12 @@ def compare(
     names robots is a study: every method on several robots and kinds of path. Run again with the same -o, it goes on
     where it was stopped.
     """
+    from platformdirs import user_cache_path
+
     from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
     from omnibench.compare.report.document import comparison_document
+    from omnibench.compare.report.searches import write_traces
+    from omnibench.compare.report.view import views
 
     shared.refuse_figures_without_browser(figures)
     asked = shared.plugin_folders(plugins or [])
@@ -68,8 +78,13 @@ def compare(
     chosen = chosen.model_copy(
         update={"plugins": folders} | {name: value for name, value in given.items() if value is not None}
     )
+    chosen = _with_added(chosen, added or ())
     with ProgressDisplay() as watch:
-        result = omnibench.run_comparison(chosen, output, watch, force=force)
+        kept = user_cache_path("omnibench") / "fits" if added else None
+        result = omnibench.run_comparison(chosen, output, watch, force=force, cache=kept)
+        if traces is not None:
+            files = [file for view in views(result) for file in write_traces(view, traces / view.name)]
+            typer.echo(f"traces: {traces} ({len(files)} searches)", err=True)
         if figures is not None:
             watch(Progress("drawing the figures"))
             shared.write_asked_figures(comparison_document(result), figures)
@@ -80,6 +95,23 @@ def compare(
     typer.echo(f"report: {result.output / 'report.html'}")
     if not print_comparison_ending(result):
         raise typer.Exit(1)
+
+
+def _with_added(config: "CompareConfig", files: Sequence[Path]) -> "CompareConfig":
+    """The config with an entry for each calibrator of some plug-in files. PluginError: a file has none, or fails."""
+    from omnibench.compare.config import CalibratorEntry
+    from omnibench.errors import PluginError
+    from omnibench.registry import calibrators
+
+    for file in map(Path.resolve, files):
+        shared.load_given_plugins([Path("none")], [file])
+        names = [entry.name for entry in calibrators.entries() if entry.origin == str(file)]
+        if not names:
+            raise PluginError(f"{file}: registers no calibrator (omnibench guide plugins)")
+        key = "methods" if config.methods else "calibrators"
+        entries = (*getattr(config, key), *(CalibratorEntry(name=name) for name in names))
+        config = config.model_copy(update={key: entries, "plugins": (*config.plugins, file)})
+    return config
 
 
 def _asked_comparison(given: Sequence[Path], data: list[str] | None, plugins: Sequence[Path]) -> "CompareConfig":

@@ -182,12 +182,18 @@ class _Runs(JobWatch[RunResult]):
 
 
 def run_comparison(
-    config: CompareConfig, output: Path | None = None, progress: Reporter = no_progress, *, force: bool = False
+    config: CompareConfig,
+    output: Path | None = None,
+    progress: Reporter = no_progress,
+    *,
+    force: bool = False,
+    cache: Path | None = None,
 ) -> ComparisonResult:
     """Fit every calibrator of the config to every training set, score the answers, and write results and report.
 
     output: the folder of results; fits whose results are there are not repeated. progress: told of the making of data
-    sets and of every fit. force: write into a folder with other files, or of a comparison of another name.
+    sets and of every fit. force: write into a folder with other files, or of a comparison of another name. cache: where
+    the results of fits are kept, by the hash of their data and code, in the place of the folder of results.
 
     ConfigError or DataError: the config, a data set or the folder is unfit, no robot's recordings can be read, or the
     disk refuses. Interrupted: Ctrl-C; the results of all fits that had ended are kept.
@@ -212,7 +218,7 @@ def run_comparison(
                 folder = prepare_output(config, output, force=force)
                 if output is None:
                     lock.enter_context(results_locked(folder))
-                store = ResultStore(folder / "runs", RunResult)
+                store = ResultStore(cache or folder / "runs", RunResult)
                 with resumable(fits, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                     results = execute(fits, store, progress, backend)
         with resumable(fits, store, folder):
@@ -237,7 +243,8 @@ def assess(
     broken: why recordings could not be read, by robot. failures: plug-ins that could not be imported. PluginError: a
     cost raises.
     """
-    scored, designs = score_fits(config, fits, results, progress if config.robots else no_progress)
+    told = progress if config.robots else no_progress  # a data set is judged at once
+    scored, designs = score_fits(config, fits, results, told)
     runs, certificates = certify(config.certificate, scored)
     of_datasets = [run for run in runs if run.row is not None]
     statistics = entry_statistics(of_datasets, config.bootstrap)
