@@ -153,7 +153,7 @@ def fetch(
 
     Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
     """
-    from omnibench.cli.fetch import RECORDINGS, fetch_recording
+    from omnibench.cli.fetch import GITHUB, RECORDINGS, fetch_recording
 
     if name is None:
         for recording in RECORDINGS:
@@ -174,8 +174,8 @@ def fetch(
         licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
     say(f"source: {fetched.source}, in {fetched.folder}")
     say(f"licence: {licence}")
-    say(f"cite: {fetched.cite}")
-    holds = f"{fetched.folder} holds {fetched.repository}"
+    say(f"cite: {fetched.recording.article or f'{GITHUB}/{fetched.recording.repository}'}")
+    holds = f"{fetched.folder} holds {fetched.recording.repository}"
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
         if several:
