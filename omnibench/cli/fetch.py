@@ -79,18 +79,24 @@ class _Catalogue(Model):
 RECORDINGS = read_model(_Catalogue, Path(__file__).with_name("recordings.yaml")).recordings
 
 
-def find_recording(name: str) -> PublicRecording:
-    """The recording of a name: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
-
-    One that the catalogue does not hold has no importer, and is one data set. ConfigError names the nearest known name
-    and lists all.
-    """
+def known_names() -> dict[str, PublicRecording]:
+    """The recordings of the catalogue, and those of one data set, by each name that they have."""
     known: dict[str, PublicRecording] = {}
     for recording in RECORDINGS:
         known |= {recording.name: recording, recording.repository.lower(): recording}
         for dataset in recording.datasets:
             one = recording.model_copy(update={"datasets": (dataset,)})
             known |= {dataset.name: one, f"{recording.name}/{dataset.name}": one}
+    return known
+
+
+def find_recording(name: str) -> PublicRecording:
+    """The recording of a name: a recording, a data set, RECORDING/DATASET, or OWNER/REPO on GitHub.
+
+    One that the catalogue does not hold has no importer, and is one data set. ConfigError names the nearest known name
+    and lists all.
+    """
+    known = known_names()
     repository = _ADDRESS.sub("", name)
     if (asked := known.get(name) or known.get(repository.lower())) is not None:
         return asked

@@ -37,17 +37,20 @@ class CostChoice(Model):
 class FitSettings(Model):
     """Every choice of a fit. ``calibrate`` fills fields that are None with defaults for the robot and its runs.
 
-    ``omnibench calibrate --help`` prints the descriptions of the fields.
+    The fields are the options of ``omnibench calibrate``, with their descriptions.
     """
 
     calibrator: str | None = Field(
         None,
         description="How to fit; omnibench list names all. Default: map, the most probable model given the references "
         "and the design.",
+        json_schema_extra={"names": "omnibench.registry:calibrators.entries"},
     )
     options: dict[str, Any] = Field({}, description="Options of the calibrator.")
     cost: CostChoice | None = Field(
-        None, description="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs."
+        None,
+        description="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs.",
+        json_schema_extra={"names": "omnibench.registry:costs.entries"},
     )
     loss: LossName = Field(
         "squares", description="huber, student_t: bound the influence of reference poses that are far off."

@@ -264,27 +264,41 @@ class WrittenSimulation:
     accuracy: SlamAccuracy | None = None
 
 
-@dataclass(frozen=True)
-class SimulationRequest:
-    """Arguments of ``omnibench simulate``: either ``config``, or ``like`` with ``model``.
+class SimulationRequest(Model):
+    """What ``omnibench simulate`` was asked for: either ``config``, or ``like`` with ``model``.
 
-    effects: to hide besides those of the config, each as YAML. noise: add the calibration's noise (with ``like``).
-    seed: of that noise; default 0. force: replace what is there. ConfigError in one line: options that exclude each
-    other.
+    ConfigError in one line: options that exclude each other.
     """
 
     output: Path
     config: Path | None = None
-    truth: Path | None = None
-    dataset: str | None = None
-    effects: tuple[str, ...] = ()
-    like: Path | None = None
-    model: Path | None = None
-    noise: bool = False
-    seed: int | None = None
+    truth: Path | None = Field(
+        None,
+        description="Folder for the truth: matrix, effects, true poses. Default: not written.",
+        json_schema_extra={"metavar": "DIR"},
+    )
+    dataset: str | None = Field(None, description="Name of the data set, if the config has several.")
+    effects: tuple[str, ...] = Field(
+        (),
+        description="Add an effect, 'name: {parameter: value}'; may be repeated.",
+        json_schema_extra={"option": "--effect", "metavar": "YAML", "names": "omnibench.registry:effects.entries"},
+    )
+    like: Path | None = Field(
+        None,
+        description="Instead of CONFIG: drive this data set's recorded wheel rates.",
+        json_schema_extra={"metavar": "DATASET"},
+    )
+    model: Path | None = Field(
+        None,
+        description="With --like: the true model, a calibration file.",
+        json_schema_extra={"metavar": "CALIBRATION"},
+    )
+    noise: bool = Field(False, description="With --like: add the noise that the calibration states.")
+    seed: int | None = Field(None, ge=0, description="With --noise: its seed. Default: 0.")
     force: bool = False
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _go_together(self) -> SimulationRequest:
         if self.like is None and self.model is None:
             if self.config is None:
                 raise ConfigError("name a CONFIG with a simulated data set, or --like DATASET --model CALIBRATION")
@@ -304,6 +318,7 @@ class SimulationRequest:
                 raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
         if self.truth is not None and resolved(self.truth).is_relative_to(resolved(self.output)):
             raise ConfigError("--truth: must be a folder apart from the data set's")
+        return self
 
     @cached_property
     def source(self) -> SimulationSource:

@@ -33,6 +33,7 @@ _WITHOUT_TABLES = (
 )
 _QUICK = (
     ("list", "--plugins", "none"),
+    ("list", "effects", "--plugins", "none"),
     ("calibrate", "{data}"),
     ("evaluate", "{calibration}", "{data}"),
     ("inspect", "{swerve}"),
