@@ -67,7 +67,19 @@ def names_in(place: str) -> Callable[[], list[str]]:
     return names
 
 
-IMPORTERS = "omnibench.registry:importers.entries"
+IMPORTER_NAMES = names_in("omnibench.registry:importers.entries")
+_EFFECT_NAMES = names_in("omnibench.registry:effects.entries")
+# By the names of fields.
+_NAMES = {
+    "calibrator": names_in("omnibench.registry:calibrators.entries"),
+    "cost": names_in("omnibench.registry:costs.entries"),
+    "effect": _EFFECT_NAMES,
+    "without": _EFFECT_NAMES,
+}
+_METAVARS = {
+    "area": "AxB", "effect": "YAML", "like": "DATASET", "model": "CALIBRATION", "robot": "FILE", "truth": "DIR",
+    "without": "NAME",
+}  # fmt: skip
 
 
 class _Place(str):
@@ -156,7 +168,7 @@ _TYPES: dict[str, Any] = {"string": str, "integer": int, "number": float, "boole
 def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
     """Parameters of a function, from which Typer makes options: one for each field of a model, and of those within.
 
-    A field's ``json_schema_extra`` may hold its option's name, its metavar, and the place of names for completion.
+    Help and completion know of a field what ``_METAVARS`` and ``_NAMES`` say.
     """
     from pydantic import BaseModel
 
@@ -176,15 +188,13 @@ def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
         least = schema.get("minimum", schema.get("exclusiveMinimum"))
         if annotation is int and "exclusiveMinimum" in schema:
             least = schema["exclusiveMinimum"] + 1
-        extra: dict[str, Any] = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        spelling = extra.get("option") or (f"--{name.replace('_', '-')}" if field.default is False else None)
         made = option(
             field.description or "",
-            *filter(None, [spelling]),
+            *([f"--{name.replace('_', '-')}"] if field.default is False else []),
             default=None if several else field.default,
             min=least,
-            metavar=extra.get("metavar"),
-            autocompletion=names_in(extra["names"]) if "names" in extra else None,
+            metavar=_METAVARS.get(name),
+            autocompletion=_NAMES.get(name),
         )
         annotation = list[annotation] if several else annotation
         annotation = annotation | None if made.default is None else annotation
@@ -202,7 +212,6 @@ def _values(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
 
 DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
 CALIBRATION = argument("Calibration file.", ...)
-WHICH_DATASET = option("Name of the data set, if the config has several.")
 JSON = flag("Print one JSON document on standard output, and nothing else.", "--json")
 FORCE = flag("Replace what is there already.", "--force")
 FIGURES = option("Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).", metavar="DIR")

@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.options import IMPORTERS, argument, flag, names_in, option, options_of, output_option
+from omnibench.cli.options import IMPORTER_NAMES, argument, flag, names_in, option, options_of, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -52,7 +52,7 @@ def import_(
         "Format of the recordings; import FORMAT --help shows its options.",
         ...,
         metavar="FORMAT",
-        autocompletion=names_in(IMPORTERS),
+        autocompletion=IMPORTER_NAMES,
     ),
     source: Path | None = argument("File or folder with the recordings."),
     output: Path | None = output_option("Data set folder to write."),
@@ -203,10 +203,7 @@ def check(
         "Data set folder, or several; folder or file of CSV tables, or a bag.", ..., metavar="SOURCE..."
     ),
     importer: str | None = option(
-        "Importer of the source. Default: by its files.",
-        "--format",
-        metavar="NAME",
-        autocompletion=names_in(IMPORTERS),
+        "Importer of the source. Default: by its files.", "--format", metavar="NAME", autocompletion=IMPORTER_NAMES
     ),
     robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
     settings: list[str] | None = shared.SETTINGS,

@@ -260,9 +260,7 @@ class DesignRequest(Model):
         None, description="Path within a sample; see calibrate. Default: the config's, or arc for a data set."
     )
     robot: Path | None = Field(
-        None,
-        description="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml).",
-        json_schema_extra={"metavar": "FILE"},
+        None, description="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."
     )
     max_speed: float | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
     max_turn_rate: float | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
@@ -272,11 +270,7 @@ class DesignRequest(Model):
     steering_limit: float | None = Field(
         None, description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
     )
-    area: str | None = Field(
-        None,
-        description="With --robot: free floor, m, like 3x2.5. Default: 3x3.",
-        json_schema_extra={"metavar": "AxB"},
-    )
+    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
     position_noise: float | None = Field(
         None, description="With --robot: of the reference's positions, m. Default: 0.005."
     )

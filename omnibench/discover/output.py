@@ -24,16 +24,8 @@ class DiscoverOptions(Model):
     """The options of ``omnibench discover``, and the content of its config.yaml."""
 
     dataset: Path
-    model: Path | None = Field(
-        None,
-        description="Start from this calibration. Default: fit a matrix.",
-        json_schema_extra={"metavar": "CALIBRATION"},
-    )
-    without: tuple[str, ...] = Field(
-        (),
-        description="Effect not to try; may be repeated.",
-        json_schema_extra={"metavar": "NAME", "names": "omnibench.registry:effects.entries"},
-    )
+    model: Path | None = Field(None, description="Start from this calibration. Default: fit a matrix.")
+    without: tuple[str, ...] = Field((), description="Effect not to try; may be repeated.")
     unknown_term: bool = Field(
         True, description="Where no name is sure, close the gap all the same, by a term without a name."
     )

@@ -44,13 +44,10 @@ class FitSettings(Model):
         None,
         description="How to fit; omnibench list names all. Default: map, the most probable model given the references "
         "and the design.",
-        json_schema_extra={"names": "omnibench.registry:calibrators.entries"},
     )
     options: dict[str, Any] = Field({}, description="Options of the calibrator.")
     cost: CostChoice | None = Field(
-        None,
-        description="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs.",
-        json_schema_extra={"names": "omnibench.registry:costs.entries"},
+        None, description="What to minimise (see omnibench list). Default: final_pose; trajectory, of few runs."
     )
     loss: LossName = Field(
         "squares", description="huber, student_t: bound the influence of reference poses that are far off."

@@ -273,26 +273,12 @@ class SimulationRequest(Model):
     output: Path
     config: Path | None = None
     truth: Path | None = Field(
-        None,
-        description="Folder for the truth: matrix, effects, true poses. Default: not written.",
-        json_schema_extra={"metavar": "DIR"},
+        None, description="Folder for the truth: matrix, effects, true poses. Default: not written."
     )
     dataset: str | None = Field(None, description="Name of the data set, if the config has several.")
-    effects: tuple[str, ...] = Field(
-        (),
-        description="Add an effect, 'name: {parameter: value}'; may be repeated.",
-        json_schema_extra={"option": "--effect", "metavar": "YAML", "names": "omnibench.registry:effects.entries"},
-    )
-    like: Path | None = Field(
-        None,
-        description="Instead of CONFIG: drive this data set's recorded wheel rates.",
-        json_schema_extra={"metavar": "DATASET"},
-    )
-    model: Path | None = Field(
-        None,
-        description="With --like: the true model, a calibration file.",
-        json_schema_extra={"metavar": "CALIBRATION"},
-    )
+    effect: tuple[str, ...] = Field((), description="Add an effect, 'name: {parameter: value}'; may be repeated.")
+    like: Path | None = Field(None, description="Instead of CONFIG: drive this data set's recorded wheel rates.")
+    model: Path | None = Field(None, description="With --like: the true model, a calibration file.")
     noise: bool = Field(False, description="With --like: add the noise that the calibration states.")
     seed: int | None = Field(None, ge=0, description="With --noise: its seed. Default: 0.")
     force: bool = False
@@ -310,7 +296,7 @@ class SimulationRequest(Model):
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
             of_configs: dict[str, object] = {f"CONFIG {self.config}": self.config, "--truth": self.truth}
-            of_configs |= {"--dataset": self.dataset, "--effect": self.effects or None}
+            of_configs |= {"--dataset": self.dataset, "--effect": self.effect or None}
             _refuse(of_configs, "does not go with --like, which takes all from the recording and the calibration")
             if self.seed is not None and not self.noise:
                 raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
@@ -324,7 +310,7 @@ class SimulationRequest(Model):
     def source(self) -> SimulationSource:
         """The config's data set, with the effects. ConfigError as for ``read_simulation``."""
         assert self.config is not None
-        return read_simulation(self.config, self.dataset).with_effects(self.effects)
+        return read_simulation(self.config, self.dataset).with_effects(self.effect)
 
     @property
     def plugins(self) -> tuple[Path, ...]:
@@ -347,7 +333,7 @@ class SimulationRequest(Model):
             dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(dataset, self.output, table_format, overwrite=self.force)
             return WrittenSimulation(dataset)
-        check_effect_options(self.effects)
+        check_effect_options(self.effect)
         simulation = self.source.simulate(watch)
         save_dataset(simulation.dataset, self.output, table_format, overwrite=self.force)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None

@@ -751,16 +751,8 @@ class SlamRequest(Model):
         None, description="First guess of each scan's pose. Default: odometry."
     )
     no_deskew: bool = Field(False, description="Leave out the correction for the robot's motion during a scan.")
-    model: Path | None = Field(
-        None,
-        description="Calibration for that odometry. Default: the design values.",
-        json_schema_extra={"metavar": "CALIBRATION"},
-    )
-    truth: Path | None = Field(
-        None,
-        description="Folder that simulate --truth wrote: show the errors against it.",
-        json_schema_extra={"metavar": "DIR"},
-    )
+    model: Path | None = Field(None, description="Calibration for that odometry. Default: the design values.")
+    truth: Path | None = Field(None, description="Folder that simulate --truth wrote: show the errors against it.")
     settings: tuple[str, ...] = ()
     force: bool = False
 
