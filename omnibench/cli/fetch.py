@@ -140,12 +140,10 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
             raise DataError(f"{repository}: git could not {arguments[0]} it; {mend} (git: {words})")
         report(Progress(task, result=""))
 
-    def checked_out(clone: Path, wanted: str) -> str:
-        found, present = (_ask(clone, "rev-parse", "--verify", f"{name}^{{commit}}") for name in (wanted, NEWEST))
-        if not found:
+    def check_out(clone: Path) -> str:
+        if not (found := _commit_in(clone, commit)):
             raise ConfigError(f"{repository} has no commit {commit}; --commit {NEWEST} takes the newest")
-        if found != present or not (clone / ".git" / "index").exists():
-            work("checkout", "--detach", found, clone=clone)
+        work("checkout", "--detach", found, clone=clone)
         return found
 
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
@@ -157,9 +155,12 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
             raise ConfigError(f"{folder} is a clone of {remote or 'nothing'}, not of {repository}; {away}")
         if changed := _ask(folder, "status", "--porcelain", "--untracked-files=all").splitlines():
             raise ConfigError(f"{folder}: {changed[0].split(maxsplit=1)[-1]} is not as in the repository; {away}")
-        if not _ask(folder, "rev-parse", "--verify", f"{commit}^{{commit}}"):
+        found, present = _commit_in(folder, commit), _commit_in(folder, NEWEST)
+        if found and found == present:
+            return found
+        if not found:
             work("fetch", "origin", clone=folder)
-        return checked_out(folder, commit)
+        return check_out(folder)
     # It is cloned into a temporary folder on the same disk, and moved once it is whole.
     check_place(folder)
     existing = next(parent for parent in folder.absolute().parents if parent.is_dir())
@@ -168,12 +169,12 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
             clone = Path(temporary, "clone")
             # The whole history, in which a commit is looked for, without the files of other commits.
             work("clone", "--filter=blob:none", "--no-checkout", f"{GITHUB}/{repository}.git", clone)
-            commit = checked_out(clone, commit)
+            found = check_out(clone)
             folder.parent.mkdir(parents=True, exist_ok=True)
             clone.rename(folder)
     except OSError as error:
         raise not_written(folder, error) from None
-    return commit
+    return found
 
 
 def _git(*arguments: str | Path, clone: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -190,6 +191,11 @@ def _ask(clone: Path, *arguments: str) -> str:
     """Output of a git command in a clone; empty if the command fails."""
     answer = _git(*arguments, clone=clone)
     return answer.stdout.strip() if answer.returncode == 0 else ""
+
+
+def _commit_in(clone: Path, commit: str) -> str:
+    """The full name of a commit; empty if the clone does not hold it."""
+    return _ask(clone, "rev-parse", "--verify", f"{commit}^{{commit}}")
 
 
 @dataclass(frozen=True)

@@ -172,27 +172,21 @@ def fetch(
         return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
-    several = len(fetched.datasets) > 1
     for folder, imported in fetched.datasets.items():
-        warn(f"{folder}: {each}" if several else each for each in imported.warnings)
-    for folder, imported in fetched.datasets.items():
+        warn(f"{folder}: {warning}" for warning in imported.warnings)
         typer.echo(f"{plural(len(imported.trajectories), 'trajectory')}: {folder}")
     first, dataset = next(iter(fetched.datasets.items()), (fetched.folder, None))
-    licence = fetched.licence or "the repository states none; ask its authors before you use it"
-    if fetched.licence_file is not None:
-        licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
+    text = "" if fetched.licence_file is None else f" ({first / fetched.licence_file.name})"
     say(f"source: {fetched.source}, in {fetched.folder}")
-    say(f"licence: {licence}")
+    say(f"licence: {fetched.licence or 'the repository states none; ask its authors before you use it'}{text}")
     say(f"cite: {fetched.recording.article or f'{GITHUB}/{fetched.recording.repository}'}")
-    holds = f"{fetched.folder} holds {fetched.recording.repository}"
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-        if several:
-            holds = f"{first} and {plural(len(fetched.datasets) - 1, 'more folder')} hold the recordings"
         return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", first)
     make_console(error=True).print(f"not imported: {fetched.refusal}", soft_wrap=True)
+    holds = f"{fetched.folder} holds {fetched.recording.repository}"
     if not fetched.importer:
-        return print_ending(holds, "see what can be imported", "omnibench", "list")
+        return print_ending(holds, "see what can be imported", "omnibench", "list", "importers")
     return print_ending(holds, "see what its import needs", "omnibench", "import", fetched.importer, "--help")
 
 
