@@ -116,6 +116,7 @@ _STALLED = ("-c", "http.lowSpeedLimit=1000", "-c", "http.lowSpeedTime=60")
 _LEFT_OUT = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_ASKPASS", "SSH_ASKPASS")
 _ENDLESS = 1e6  # s; with any limit Python waits in a way that Ctrl-C ends, even where polars restarts system calls
 _COMMIT = re.compile(rf"{NEWEST}|[0-9a-fA-F]{{4,40}}")
+_REMOTE = re.compile(r"github\.com[:/]+([^/]+/[^/]+?)(?:\.git)?/?$")
 _ELSEWHERE = "import a clone made elsewhere (omnibench guide data)"
 
 
@@ -151,7 +152,8 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
         if not (folder / ".git").exists():
             raise ConfigError(f"{folder} is there already and is no clone; {away}")
         remote = _ask(folder, "config", "--get", "remote.origin.url")
-        if not _ADDRESS.sub("", remote).lower().endswith(repository.lower()):
+        cloned = _REMOTE.search(remote)
+        if cloned is None or cloned[1].lower() != repository.lower():
             raise ConfigError(f"{folder} is a clone of {remote or 'nothing'}, not of {repository}; {away}")
         if changed := _ask(folder, "status", "--porcelain", "--untracked-files=all").splitlines():
             raise ConfigError(f"{folder}: {changed[0].split(maxsplit=1)[-1]} is not as in the repository; {away}")
@@ -159,7 +161,8 @@ def open_clone(repository: str, folder: Path, commit: str, report: Reporter) -> 
         if found and found == present:
             return found
         if not found:
-            work("fetch", "origin", clone=folder)
+            whole = ("--unshallow",) if (folder / ".git" / "shallow").exists() else ()
+            work("fetch", *whole, "origin", clone=folder)
         return check_out(folder)
     # It is cloned into a temporary folder on the same disk, and moved once it is whole.
     check_place(folder)

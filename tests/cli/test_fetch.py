@@ -149,6 +149,12 @@ def test_a_clone_from_elsewhere_needs_no_network(command: Command, github: GitHu
     assert optiodom in command("fetch", "diff").stdout
 
 
+def test_a_clone_without_its_history_is_completed(command: Command, github: GitHub, optiodom: str) -> None:
+    CLONE.parent.mkdir(parents=True)
+    github.git(Path(), "clone", "-q", "--depth", "1", f"https://github.com/{OPTIODOM}", CLONE)
+    assert optiodom in command("fetch", "diff").stdout
+
+
 def test_a_data_set_that_is_there_is_refused_before_a_clone(command: Command, optiodom: str) -> None:
     assert optiodom
     Path("data/diff").mkdir(parents=True)
