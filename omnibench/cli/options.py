@@ -68,13 +68,12 @@ def names_in(place: str) -> Callable[[], list[str]]:
 
 
 IMPORTER_NAMES = names_in("omnibench.registry:importers.entries")
-_EFFECT_NAMES = names_in("omnibench.registry:effects.entries")
-# By the names of fields.
+# What completion and help know of a model's field, by its name.
 _NAMES = {
     "calibrator": names_in("omnibench.registry:calibrators.entries"),
     "cost": names_in("omnibench.registry:costs.entries"),
-    "effect": _EFFECT_NAMES,
-    "without": _EFFECT_NAMES,
+    "effect": names_in("omnibench.registry:effects.entries"),
+    "without": names_in("omnibench.registry:effects.entries"),
 }
 _METAVARS = {
     "area": "AxB", "effect": "YAML", "like": "DATASET", "model": "CALIBRATION", "robot": "FILE", "truth": "DIR",
@@ -156,7 +155,8 @@ class ModelCommand(TyperCommand):
         """Call the function with the model. ConfigError in one line: a value is wrong."""
         from omnibench.config import validate
 
-        ctx.obj = {self.callback.model[0]: validate(self._model, _values(self._model, ctx.params), str(self.name))}  # type: ignore[union-attr]
+        parameter, _, _ = self.callback.model  # type: ignore[union-attr]
+        ctx.obj = {parameter: validate(self._model, _values(self._model, ctx.params), str(self.name))}
         for name in self._made:
             del ctx.params[name]
         return super().invoke(ctx)
