@@ -766,7 +766,7 @@ class SlamRequest(Model):
     def _go_together(self) -> SlamRequest:
         if self.output is not None and resolved(self.output) == resolved(self.dataset):
             raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
-        if self.model is not None and self.options.start != "odometry":
+        if self.options.start != "odometry" and self.model is not None:
             raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
         return self
 
