@@ -112,22 +112,12 @@ def _run(command: Any) -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (until the process ends)
         elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a letter that the terminal lacks becomes a ?
-    for argument in sys.argv:
-        if not argument.isprintable() and any("\udc80" <= letter <= "\udcff" for letter in argument):
-            _end(f"error: {argument}: this name is not in UTF-8; rename the file or folder", 2)
-    usage_error: Any = typer.BadParameter.__mro__[1]  # click's UsageError, wherever this Typer keeps it
     try:
+        for argument in sys.argv:
+            argument.encode()
         code = command.main(prog_name="omnibench", standalone_mode=False)
-    except usage_error as error:
-        message = error.format_message()
-        if type(error).__name__ != "NoArgsIsHelpError":  # nothing was typed: the message is the whole help
-            typed = error.ctx.command_path if error.ctx else "omnibench"
-            message = f"error: {' '.join(message.split()).replace('Value error, ', '')} (see {typed} --help)"
-        _end(message, 2)
-    except Interrupted as error:
-        _end(str(error), _interrupted_code())
-    except typer.Abort:
-        _end(_BEGINS_ANEW, _interrupted_code())
+    except (Interrupted, typer.Abort) as error:
+        _end(str(error) or _BEGINS_ANEW, _interrupted_code())
     except BrokenPipeError:
         sys.stderr.close()  # the program that read our output has ended
         sys.exit(1)
@@ -136,7 +126,9 @@ def _run(command: Any) -> None:
         if message is None:
             raise
         notes = getattr(error, "__notes__", ())  # such as the place of results that are kept
-        _end("; ".join([f"error: {message}", *notes]), getattr(error, "exit_code", 2))
+        said = "; ".join([f"error: {message}", *notes])
+        # Where nothing was typed the message is the whole help.
+        _end(message if type(error).__name__ == "NoArgsIsHelpError" else said, getattr(error, "exit_code", 2))
     if code == 130:  # newer versions of Typer return this after Ctrl-C
         _end(_BEGINS_ANEW, _interrupted_code())
     if _signalled:  # a library has caught the interrupt

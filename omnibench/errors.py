@@ -144,10 +144,16 @@ def explain(error: BaseException, model: type[BaseModel] | None = None) -> str |
     """
     if isinstance(error, OmnibenchError):
         return str(error)
+    if (format_message := getattr(error, "format_message", None)) is not None:  # the command line refuses an option
+        if type(error).__name__ == "NoArgsIsHelpError":
+            return str(format_message())
+        context = getattr(error, "ctx", None)
+        message = " ".join(format_message().split()).replace("Value error, ", "")
+        return f"{message} (see {context.command_path if context else 'omnibench'} --help)"
     if isinstance(error, MemoryError):
         return "out of memory; make the data or the budget smaller"
-    if isinstance(error, UnicodeEncodeError):  # a file's name that was found in a folder
-        return f"{error.object[:200]}: there is a name in it that is not in UTF-8; rename that file or folder"
+    if isinstance(error, UnicodeEncodeError):  # a file's name, as typed or as found in a folder
+        return f"{error.object[:200]}: this name is not in UTF-8; rename the file or folder"
     if isinstance(error, OSError):  # a disk or a terminal that failed unexpectedly
         return f"{error.filename or 'output'}: {error.strerror or error}"
     from pydantic import ValidationError  # the command line's help does without it

@@ -10,7 +10,7 @@ import typer
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.options import argument, flag, option, output_option
+from omnibench.cli.options import argument, flag, names_in, option, options_of, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -19,6 +19,8 @@ from omnibench.progress import Progress
 
 if TYPE_CHECKING:
     from omnibench.compare.config import CompareConfig
+    from omnibench.discover.output import DiscoverOptions
+    from omnibench.fit.settings import FitSettings
 
 
 calibration_app = typer.Typer()
@@ -153,12 +155,12 @@ def _named_paths(data: list[str] | None) -> dict[str, Path]:
     return paths
 
 
-@calibration_app.command(cls=shared.FitCommand)
+@calibration_app.command(cls=shared.ModelCommand)
 @shared.grouped
 def calibrate(
-    context: typer.Context,
     dataset: list[Path] = shared.DATASETS,
     output: Path | None = output_option("Calibration file to write. Default: it is only shown.", metavar="FILE.yaml"),
+    asked: "FitSettings" = options_of("omnibench.fit.settings:FitSettings"),
     page: shared.ReportOptions = _PAGE,
     jobs: shared.BackendOptions = shared.BackendOptions(),
     settings: list[str] | None = shared.SETTINGS,
@@ -172,10 +174,15 @@ def calibrate(
     """
     from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
     from omnibench.config import parse_settings, to_yaml
+    from omnibench.registry import calibrators, costs
     from omnibench.report.calibration_report import calibration_document
 
     shared.load_given_plugins(plugins)
-    chosen = shared.chosen_settings(context, parse_settings(settings))
+    chosen = asked.model_copy(update={"options": parse_settings(settings)})
+    if chosen.calibrator is not None:
+        calibrators.entry(chosen.calibrator, "--calibrator")
+    if chosen.cost is not None:
+        costs.entry(chosen.cost.name, "--cost")
     refuse_existing(output, force=force)
     page.refuse(force=force)
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch, jobs.opened(watch) as backend:
@@ -311,7 +318,13 @@ def certify(
 @calibration_app.command()
 def export(
     calibration: Path = shared.CALIBRATION,
-    to: str = option("ros2_controllers, robot_localization or c_header.", "--to", default=..., metavar="FORMAT"),
+    to: str = option(
+        "ros2_controllers, robot_localization or c_header.",
+        "--to",
+        default=...,
+        metavar="FORMAT",
+        autocompletion=names_in("omnibench.robot.export.formats:EXPORT_FORMATS"),
+    ),
     output: Path | None = output_option("File or folder to write to. Default: standard output."),
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
@@ -336,18 +349,12 @@ def export(
         print_ending(f"{file} is written for {to}", "load it where the robot's odometry is computed")
 
 
-@calibration_app.command()
+@calibration_app.command(cls=shared.ModelCommand)
+@shared.grouped
 def discover(
     dataset: Path = argument("Data set folder.", ...),
-    model: Path | None = option(
-        "Start from this calibration. Default: fit a matrix.", "--model", metavar="CALIBRATION"
-    ),
+    options: "DiscoverOptions" = options_of("omnibench.discover.output:DiscoverOptions"),
     output: Path | None = output_option("Folder for the results. Default: results/NAME/TIME."),
-    without: list[str] | None = option("Effect not to try; may be repeated.", "--without", metavar="NAME"),
-    unknown_term: bool = option(
-        "Where no name is sure, close the gap all the same, by a term without a name.", default=True
-    ),
-    seed: int = option("Seed of the random numbers.", default=0, min=0),
     figures: Path | None = shared.FIGURES,
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
@@ -360,35 +367,21 @@ def discover(
     """
     from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.config import to_yaml
-    from omnibench.discover.output import DiscoverOptions, check_output, write_discovery
+    from omnibench.discover.output import check_output, write_discovery
     from omnibench.discover.report.discovery_report import discovery_report
     from omnibench.discover.result import discovery_document
     from omnibench.registry import effects
 
     shared.refuse_figures_without_browser(figures)
     shared.load_given_plugins(plugins)
-    for name in without or ():
+    for name in options.without:
         effects.entry(name, "--without")
-    options = DiscoverOptions(
-        dataset=str(dataset),
-        model=None if model is None else str(model),
-        without=tuple(without or ()),
-        unknown_term=unknown_term,
-        seed=seed,
-        plugins=tuple(map(str, plugins or ())),
-    )
     check_output(output, options, force=force)
-    start = None if model is None else omnibench.read_calibration(model)
+    start = None if options.model is None else omnibench.read_calibration(options.model)
     recordings = omnibench.load_dataset(dataset)
+    chosen = options.model_dump(include={"without", "unknown_term", "seed"})
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch:
-        discovery = omnibench.discover_effects(
-            recordings,
-            without=tuple(without or ()),
-            unknown_term=unknown_term,
-            seed=seed,
-            watch=watch,
-            calibration=start,
-        )
+        discovery = omnibench.discover_effects(recordings, **chosen, watch=watch, calibration=start)
         watch(Progress("writing the report"))
         folder = write_discovery(discovery, options, output, force=force)
         if figures is not None:

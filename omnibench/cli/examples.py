@@ -71,7 +71,7 @@ def write_example(example: Example, folder: Path, *, force: bool = False) -> lis
         return list(missing)
     from omnibench.simulate.source import SimulationRequest
 
-    SimulationRequest(recording, folder / example.files[0], force=force).write("csv")
+    SimulationRequest(output=recording, config=folder / example.files[0], force=force).write("csv")
     return [*missing, recording]
 
 

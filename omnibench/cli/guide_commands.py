@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from omnibench.cli import options as shared
-from omnibench.cli.options import argument, flag, option, output_option
+from omnibench.cli.options import argument, flag, names_in, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say
 from omnibench.errors import ConfigError
 from omnibench.files import resolved
@@ -30,7 +30,10 @@ _MOST_LISTED = 10  # files of a folder that are written out by name
 
 @guide_app.command()
 def guide(
-    topic: str | None = argument("What to read about. Default: the list of topics."),
+    topic: str | None = argument(
+        "What to read about. Default: the list of topics.",
+        autocompletion=names_in("omnibench.cli.handbook_topics:topics"),
+    ),
 ) -> None:
     """Show the handbook: a topic, or the list of topics."""
     from omnibench.cli.handbook_topics import find_topic, topics
@@ -59,7 +62,9 @@ def guide(
 
 @guide_app.command()
 def example(
-    name: str | None = argument("One of the list that is shown without it."),
+    name: str | None = argument(
+        "One of the list that is shown without it.", autocompletion=names_in("omnibench.cli.examples:EXAMPLES")
+    ),
     output: Path | None = output_option("Folder to write to.", metavar="DIR"),
     force: bool = shared.FORCE,
 ) -> None:
@@ -111,35 +116,43 @@ _CONFIGS = {
 
 
 @guide_app.command("list")
-def list_(plugins: list[Path] | None = shared.PLUGINS, as_json: bool = shared.JSON) -> None:
+def list_(
+    kind: Literal["calibrators", "costs", "effects", "importers"] | None = argument(
+        "Show what each of a kind is and where it comes from. Default: the names of all."
+    ),
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
+) -> None:
     """List calibrators, costs, effects and importers.
 
-    Each with where it comes from: built in, a plug-in's file, or an installed package.
+    Those of one kind each with where it comes from: built in, a plug-in's file, or an installed package.
     """
     from omnibench.cli.terminal.tables import print_table
     from omnibench.registry import REGISTRIES, Entry
     from omnibench.report.blocks import Column, Row, Table
 
     failures = shared.load_given_plugins(plugins)
+    entries = {f"{registry.kind}s": registry.entries() for registry in REGISTRIES}
+    if kind is not None:
+        entries = {kind: entries[kind]}
     if as_json:
         # All that a config can name, with the JSON schema of its options, and the plug-ins that failed.
         def row(entry: Entry[object]) -> dict[str, object]:
             options = entry.options.model_json_schema().get("properties", {})
             return {"name": entry.name, "summary": entry.summary, "from": entry.origin, "options": options}
 
-        named = {f"{registry.kind}s": [row(entry) for entry in registry.entries()] for registry in REGISTRIES}
+        named = {name: [row(entry) for entry in listed] for name, listed in entries.items()}
         failed = [{"from": failure.origin, "error": failure.error} for failure in failures]
         return print_json({**named, "failures": failed})
+    what = "all of these may be named in configs"
+    if kind is None:
+        names = {f"{name} ({len(listed)})": ", ".join(e.name for e in listed) for name, listed in entries.items()}
+        print_names(names, _NAME_WIDTH)
+        return print_ending(what, "see what those of a kind are", "omnibench", "list", "calibrators")
     columns = tuple(Column(heading, numeric=False) for heading in ("name", "what", "from"))
-    for registry in REGISTRIES:
-        rows = tuple(Row.of(entry.name, entry.summary, entry.origin) for entry in registry.entries())
-        if rows:
-            print_table(make_console(), Table(f"{registry.kind}s", columns, rows))
-        else:
-            make_console().print(f"{registry.kind}s: none yet")
-    return print_ending(
-        "all of these may be named in configs", "read how to choose", "omnibench", "guide", "calibrators"
-    )
+    rows = tuple(Row.of(entry.name, entry.summary, entry.origin) for entry in entries[kind])
+    print_table(make_console(), Table(kind, columns, rows))
+    return print_ending(what, "read how to choose", "omnibench", "guide", "calibrators")
 
 
 @guide_app.command()

@@ -1,7 +1,7 @@
 """Options and arguments that several commands share, and the plug-ins that ``--plugins`` names.
 
-The options of ``calibrate``, one for every choice of FitSettings, are made when the command is called: ``omnibench
---help`` makes none of them, and so imports nothing of the fit.
+Where a model holds what a command was asked for, as FitSettings for ``calibrate``, its fields are the options: their
+names, defaults, limits and descriptions. The model is imported when the command is called, not by ``omnibench --help``.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
@@ -26,7 +26,6 @@ from omnibench.files import refuse_existing
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from omnibench.fit.settings import FitSettings
     from omnibench.jobs.job import Backend, TlsFiles
     from omnibench.progress import Reporter
     from omnibench.registry import PluginFailure
@@ -53,27 +52,74 @@ def output_option(text: str, **settings: Any) -> Any:
     return option(text, "-o", "--output", **settings)
 
 
+def names_in(place: str) -> Callable[[], list[str]]:
+    """Tab completion by the names of what a place holds: module:attribute, or a function there that takes nothing.
+
+    Names of plug-ins are not among them, since no plug-in is run while somebody types.
+    """
+
+    def names() -> list[str]:
+        from pkgutil import resolve_name
+
+        held = resolve_name(place)
+        return [getattr(each, "name", each) for each in (held() if callable(held) else held)]
+
+    return names
+
+
+IMPORTER_NAMES = names_in("omnibench.registry:importers.entries")
+# What completion and help know of a model's field, by its name.
+_NAMES = {
+    "calibrator": names_in("omnibench.registry:calibrators.entries"),
+    "cost": names_in("omnibench.registry:costs.entries"),
+    "effect": names_in("omnibench.registry:effects.entries"),
+    "without": names_in("omnibench.registry:effects.entries"),
+}
+_METAVARS = {
+    "area": "AxB", "effect": "YAML", "like": "DATASET", "model": "CALIBRATION", "robot": "FILE", "truth": "DIR",
+    "without": "NAME",
+}  # fmt: skip
+
+
+class _Place(str):
+    """Where a model is: module:class."""
+
+
+def options_of(place: str) -> Any:
+    """Default of a ModelCommand's parameter that stands for a model, module:class; its fields become options.
+
+    Not those fields that are parameters of the command by themselves, nor those that no option can hold.
+    """
+    return _Place(place)
+
+
 def grouped(function: Callable[..., None]) -> Callable[..., None]:
     """Decorator of a command, for which a parameter that is a group of options by default adds all of them.
 
-    A group is a dataclass whose fields are options; the command gets one with the values that were given.
+    A group is a dataclass whose fields are options, or ``options_of`` a model; the command gets one with the values
+    that were given.
     """
-    groups, parameters = dict[str, Any](), list[inspect.Parameter]()
+    groups, model = dict[str, Any](), None
+    parameters = [inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)]
     for parameter in inspect.signature(function).parameters.values():
-        if not is_dataclass(group := parameter.default):
+        group = parameter.default
+        if isinstance(group, _Place):
+            model = parameter.name, group, len(parameters) - 1
+        elif is_dataclass(group):
+            groups[parameter.name], types = group, get_type_hints(type(group))
+            for field in fields(group):
+                default = getattr(group, field.name)
+                parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
+        else:
             parameters.append(parameter)
-            continue
-        groups[parameter.name], types = group, get_type_hints(type(group))
-        for field in fields(group):
-            default = getattr(group, field.name)
-            parameters.append(parameter.replace(name=field.name, default=default, annotation=types[field.name]))
 
     @wraps(function)
-    def command(*arguments: Any, **given: Any) -> None:
+    def command(context: typer.Context, **given: Any) -> None:
         for name, group in groups.items():
             given[name] = replace(group, **{field.name: given.pop(field.name) for field in fields(group)})
-        function(*arguments, **given)
+        function(**given, **(context.obj or {}))
 
+    command.__dict__["model"] = model
     return _with_parameters(command, parameters)
 
 
@@ -84,9 +130,88 @@ def _with_parameters(function: Callable[..., None], parameters: list[inspect.Par
     return function
 
 
+class ModelCommand(TyperCommand):
+    """A command with options that are the fields of a model, by ``options_of`` in its ``grouped`` function."""
+
+    _model: Any = None
+    _made: tuple[str, ...] = ()  # names of the options that are the model's
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The command's options and arguments; those of the model stand in the place of the function's parameter."""
+        if self._model is None:
+            from pkgutil import resolve_name
+
+            _, place, index = self.callback.model  # type: ignore[union-attr]
+            self._model = resolve_name(place)
+            known = {parameter.name for parameter in self.params}
+            app = typer.Typer(add_completion=False)
+            made = [parameter for parameter in _parameters(self._model) if parameter.name not in known]
+            app.command()(_with_parameters(lambda: None, made))
+            self._made = tuple(parameter.name for parameter in made)
+            self.params[index:index] = typer.main.get_command(app).params
+        return super().get_params(ctx)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Call the function with the model. ConfigError in one line: a value is wrong."""
+        from omnibench.config import validate
+
+        parameter, _, _ = self.callback.model  # type: ignore[union-attr]
+        ctx.obj = {parameter: validate(self._model, _values(self._model, ctx.params), str(self.name))}
+        for name in self._made:
+            del ctx.params[name]
+        return super().invoke(ctx)
+
+
+_TYPES: dict[str, Any] = {"string": str, "integer": int, "number": float, "boolean": bool}
+
+
+def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
+    """Parameters of a function, from which Typer makes options: one for each field of a model, and of those within.
+
+    Help and completion know of a field what ``_METAVARS`` and ``_NAMES`` say.
+    """
+    from pydantic import BaseModel
+
+    properties = model.model_json_schema()["properties"]
+    for name, field in model.model_fields.items():
+        if isinstance(field.default, BaseModel):
+            yield from _parameters(type(field.default))
+            continue
+        kinds: list[dict[str, Any]] = properties[name].get("anyOf", [properties[name]])
+        schema = next((kind for kind in kinds if "type" in kind), {})
+        several = schema.get("type") == "array"
+        schema = schema.get("items", {}) if several else schema
+        if schema.get("type") not in _TYPES:
+            continue
+        annotation: Any = Path if schema.get("format") == "path" else _TYPES[schema["type"]]
+        annotation = Literal[tuple(schema["enum"])] if "enum" in schema else annotation
+        least = schema.get("minimum", schema.get("exclusiveMinimum"))
+        if annotation is int and "exclusiveMinimum" in schema:
+            least = schema["exclusiveMinimum"] + 1
+        made = option(
+            field.description or "",
+            *([f"--{name.replace('_', '-')}"] if field.default is False else []),
+            default=None if several else field.default,
+            min=least,
+            metavar=_METAVARS.get(name),
+            autocompletion=_NAMES.get(name),
+        )
+        annotation = list[annotation] if several else annotation
+        annotation = annotation | None if made.default is None else annotation
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=annotation)
+
+
+def _values(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a model's fields, of those within by their names; None was not given."""
+    from pydantic import BaseModel
+
+    within = {name: type(field.default) for name, field in model.model_fields.items()}
+    values = {name: _values(kind, given) for name, kind in within.items() if issubclass(kind, BaseModel)}
+    return values | {name: given[name] for name in model.model_fields if given.get(name) is not None}
+
+
 DATASETS = argument("Data set folder; several of one robot, or a glob, count as one.", ..., metavar="DATASET...")
 CALIBRATION = argument("Calibration file.", ...)
-WHICH_DATASET = option("Name of the data set, if the config has several.")
 JSON = flag("Print one JSON document on standard output, and nothing else.", "--json")
 FORCE = flag("Replace what is there already.", "--force")
 FIGURES = option("Also write each figure of the report, as SVG and PNG (by Chromium or Chrome).", metavar="DIR")
@@ -240,73 +365,3 @@ def load_given_plugins(given: Sequence[Path] | None, files: Sequence[Path] | Non
     for failure in failures:
         warn([f"plug-in {failure.origin} cannot be imported: {failure.error}"])
     return failures
-
-
-_TYPES: dict[str, Any] = {"string": str, "integer": int, "number": float, "boolean": bool}
-
-
-class FitCommand(TyperCommand):
-    """A command whose options are those of its function, and one for each field of FitSettings.
-
-    The function reads the values of the latter from ``context.obj``, a mapping by field name.
-    """
-
-    _choices: tuple[str, ...] = ()
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """The command's options and arguments; the options of FitSettings come after ``--output``."""
-        if not self._choices:
-            from omnibench.fit.settings import FitSettings
-
-            app = typer.Typer(add_completion=False)
-            app.command()(_with_parameters(lambda: None, list(_parameters(FitSettings))))
-            made: list[Any] = list(typer.main.get_command(app).params)
-            self._choices = tuple(parameter.name for parameter in made)
-            after = 1 + [parameter.name for parameter in self.params].index("output")
-            self.params[after:after] = made
-        return super().get_params(ctx)
-
-    def invoke(self, ctx: Any) -> Any:
-        """Call the function, with the values of FitSettings' options in ``ctx.obj``."""
-        ctx.obj = {name: ctx.params.pop(name) for name in self._choices}
-        return super().invoke(ctx)
-
-
-def _parameters(model: type[BaseModel]) -> Iterator[inspect.Parameter]:
-    """Parameters of a function, from which Typer makes options: one for each field of a model."""
-    from pydantic import BaseModel
-
-    properties = model.model_json_schema()["properties"]
-    for name, field in model.model_fields.items():
-        if isinstance(field.default, BaseModel):
-            yield from _parameters(type(field.default))
-            continue
-        kinds = properties[name].get("anyOf", [properties[name]])
-        schema = next((kind for kind in kinds if kind.get("type") in _TYPES), None)
-        if schema is None:
-            continue
-        annotation: Any = Literal[tuple(schema["enum"])] if "enum" in schema else _TYPES[schema["type"]]
-        least = schema.get("minimum", schema.get("exclusiveMinimum"))
-        least = least + 1 if annotation is int and "exclusiveMinimum" in schema else least
-        names = [f"--{name}"] if annotation is bool else []
-        made = option(field.description or "", *names, default=field.default, min=least)
-        annotation = annotation | None if field.default is None else annotation
-        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=made, annotation=annotation)
-
-
-def chosen_settings(context: typer.Context, options: dict[str, Any]) -> FitSettings:
-    """Settings by the option values of a FitCommand, which are in its context. options: those of the calibrator.
-
-    UnknownNameError: there is no such calibrator or cost. ConfigError: a value is wrong.
-    """
-    from omnibench.config import validate
-    from omnibench.fit.settings import Budget, FitSettings
-    from omnibench.registry import calibrators, costs
-
-    choices = {name: value for name, value in context.obj.items() if value is not None}
-    if "calibrator" in choices:
-        calibrators.entry(choices["calibrator"], "--calibrator")
-    if "cost" in choices:
-        costs.entry(choices["cost"], "--cost")
-    budget = {name: choices.pop(name) for name in Budget.model_fields}
-    return validate(FitSettings, choices | {"budget": budget, "options": options}, "calibrate")

@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 
 import omnibench
 from omnibench.cli import options as shared
-from omnibench.cli.options import argument, flag, option, output_option
+from omnibench.cli.options import IMPORTER_NAMES, argument, flag, names_in, option, options_of, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
@@ -19,7 +19,10 @@ from omnibench.words import plural
 
 if TYPE_CHECKING:
     from omnibench.check.check import CheckReport
+    from omnibench.design.candidates import DesignRequest
     from omnibench.report.blocks import Document
+    from omnibench.simulate.source import SimulationRequest
+    from omnibench.slam.slam_dataset import SlamRequest
 
 
 recording_app = typer.Typer()
@@ -46,7 +49,10 @@ class HelpOfImporters(TyperCommand):
 @recording_app.command("import", cls=HelpOfImporters)
 def import_(
     importer: str = argument(
-        "Format of the recordings; import FORMAT --help shows its options.", ..., metavar="FORMAT"
+        "Format of the recordings; import FORMAT --help shows its options.",
+        ...,
+        metavar="FORMAT",
+        autocompletion=IMPORTER_NAMES,
     ),
     source: Path | None = argument("File or folder with the recordings."),
     output: Path | None = output_option("Data set folder to write."),
@@ -142,7 +148,10 @@ def import_(
 
 @recording_app.command()
 def fetch(
-    name: str | None = argument("One of the list that is shown without it, or any OWNER/REPO on GitHub."),
+    name: str | None = argument(
+        "One of the list that is shown without it, or any OWNER/REPO on GitHub.",
+        autocompletion=names_in("omnibench.cli.fetch:known_names"),
+    ),
     output: Path | None = output_option(
         "Data set folder to write; of several data sets, the folder above. Default: data/NAME."
     ),
@@ -153,7 +162,7 @@ def fetch(
 
     Your git clones it into ./clones; a clone that is there is used again. Without NAME: the list of known recordings.
     """
-    from omnibench.cli.fetch import RECORDINGS, fetch_recording
+    from omnibench.cli.fetch import GITHUB, RECORDINGS, fetch_recording
 
     if name is None:
         for recording in RECORDINGS:
@@ -163,27 +172,21 @@ def fetch(
         return None
     with ProgressDisplay() as watch:
         fetched = fetch_recording(name, output, commit=commit, force=force, report=watch)
-    several = len(fetched.datasets) > 1
     for folder, imported in fetched.datasets.items():
-        warn(f"{folder}: {each}" if several else each for each in imported.warnings)
-    for folder, imported in fetched.datasets.items():
+        warn(f"{folder}: {warning}" for warning in imported.warnings)
         typer.echo(f"{plural(len(imported.trajectories), 'trajectory')}: {folder}")
     first, dataset = next(iter(fetched.datasets.items()), (fetched.folder, None))
-    licence = fetched.licence or "the repository states none; ask its authors before you use it"
-    if fetched.licence_file is not None:
-        licence = f"{fetched.licence or 'see'} ({first / fetched.licence_file.name})"
+    text = "" if fetched.licence_file is None else f" ({first / fetched.licence_file.name})"
     say(f"source: {fetched.source}, in {fetched.folder}")
-    say(f"licence: {licence}")
-    say(f"cite: {fetched.cite}")
-    holds = f"{fetched.folder} holds {fetched.repository}"
+    say(f"licence: {fetched.licence or 'the repository states none; ask its authors before you use it'}{text}")
+    say(f"cite: {fetched.recording.article or f'{GITHUB}/{fetched.recording.repository}'}")
     if dataset is not None:
         holds = f"{first} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-        if several:
-            holds = f"{first} and {plural(len(fetched.datasets) - 1, 'more folder')} hold the recordings"
         return print_ending(holds, "see whether they are fit for calibration", "omnibench", "check", first)
     make_console(error=True).print(f"not imported: {fetched.refusal}", soft_wrap=True)
+    holds = f"{fetched.folder} holds {fetched.recording.repository}"
     if not fetched.importer:
-        return print_ending(holds, "see what can be imported", "omnibench", "list")
+        return print_ending(holds, "see what can be imported", "omnibench", "list", "importers")
     return print_ending(holds, "see what its import needs", "omnibench", "import", fetched.importer, "--help")
 
 
@@ -193,7 +196,9 @@ def check(
     source: list[Path] = argument(
         "Data set folder, or several; folder or file of CSV tables, or a bag.", ..., metavar="SOURCE..."
     ),
-    importer: str | None = option("Importer of the source. Default: by its files.", "--format", metavar="NAME"),
+    importer: str | None = option(
+        "Importer of the source. Default: by its files.", "--format", metavar="NAME", autocompletion=IMPORTER_NAMES
+    ),
     robot: Path | None = option("robot.yaml, where the source does not say the robot.", metavar="FILE"),
     settings: list[str] | None = shared.SETTINGS,
     page: shared.ReportOptions = shared.report_options("Write a page with figures of clocks and findings."),
@@ -265,33 +270,13 @@ def inspect(
     return print_ending(told, "calibrate it", "omnibench", "calibrate", *dataset, "-o", "calibration.yaml")
 
 
-@recording_app.command()
+@recording_app.command(cls=shared.ModelCommand)
+@shared.grouped
 def design(
-    source: Path | None = argument("Data set folder, or config of a comparison or a design.", metavar="DATASET|CONFIG"),
-    use: Literal["trajectory", "final"] = option(
-        "Reference poses to calibrate from: all of a run's, or only its final one.", default="trajectory"
+    source: Path | None = argument(  # noqa: ARG001 (a field of the request)
+        "Data set folder, or config of a comparison or a design.", metavar="DATASET|CONFIG"
     ),
-    per: Literal["run", "second", "metre"] = option("Effort to keep small: runs, time or distance.", default="run"),
-    runs: int | None = option("Runs to choose. Default: the fewest within 1 % of the optimum.", min=1),
-    repetitions: int | None = option("How often a command may be chosen at most.", min=1),
-    dataset: str | None = shared.WHICH_DATASET,
-    integration: Literal["euler", "arc"] | None = option(
-        "Path within a sample; see calibrate. Default: the config's, or arc for a data set."
-    ),
-    robot: Path | None = option(
-        "Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml).", metavar="FILE"
-    ),
-    max_speed: float | None = option("With --robot: its greatest speed, m/s. Default: 0.5."),
-    max_turn_rate: float | None = option("With --robot: its fastest turn, rad/s. Default: 1."),
-    max_wheel_rate: float | None = option(
-        "With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
-    ),
-    steering_limit: float | None = option(
-        "With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
-    ),
-    area: str | None = option("With --robot: free floor, m, like 3x2.5. Default: 3x3.", metavar="AxB"),
-    position_noise: float | None = option("With --robot: of the reference's positions, m. Default: 0.005."),
-    heading_noise: float | None = option("With --robot: of the reference's headings, deg. Default: 0.3."),
+    request: "DesignRequest" = options_of("omnibench.design.candidates:DesignRequest"),
     output: Path | None = output_option("Folder for report.html and design.json. Default: nothing is written."),
     figures: Path | None = shared.FIGURES,
     force: bool = shared.FORCE,
@@ -305,18 +290,13 @@ def design(
     """
     from omnibench.cli.terminal.recording_tables import print_design
     from omnibench.config import to_json
-    from omnibench.design.candidates import RobotOptions, design_source
     from omnibench.design.report import design_document
 
     shared.refuse_figures_without_browser(figures)
     if output is not None:
         refuse_existing(output / "design.json", output / "report.html", force=force)
     shared.load_given_plugins(plugins)
-    limits = RobotOptions(max_speed, max_turn_rate, max_wheel_rate, steering_limit, area, position_noise, heading_noise)
-    candidates = design_source(source, robot, limits, dataset=dataset, integration=integration)
-    chosen = omnibench.design_experiment(
-        candidates, use=use, per=per, runs=runs, repetitions=repetitions, dataset=dataset, integration=integration
-    )
+    chosen = omnibench.design_experiment(request.candidates(), **request.choices)
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
     page = shared.ReportOptions(None if output is None else output / "report.html", figures)
@@ -331,17 +311,14 @@ def design(
     return print_ending(f"{what} tell the most of {chosen.robot}", drive)
 
 
-@recording_app.command()
+@recording_app.command(cls=shared.ModelCommand)
 @shared.grouped
 def slam(
-    dataset: Path = argument("Data set folder with laser scans.", ...),
+    dataset: Path = argument("Data set folder with laser scans.", ...),  # noqa: ARG001 (a field of the request)
     output: Path | None = output_option("Data set folder to write, with the new poses."),
-    start: Literal["odometry", "last_pose"] | None = option("First guess of each scan's pose. Default: odometry."),
-    no_deskew: bool = flag("Leave out the correction for the robot's motion during a scan.", "--no-deskew"),
-    model: Path | None = option("Calibration for that odometry. Default: the design values.", metavar="CALIBRATION"),
-    truth: Path | None = option("Folder that simulate --truth wrote: show the errors against it.", metavar="DIR"),
+    request: "SlamRequest" = options_of("omnibench.slam.slam_dataset:SlamRequest"),
     page: shared.ReportOptions = shared.report_options("Write a page with figures of scans, paths and wheels."),
-    settings: list[str] | None = shared.SETTINGS,
+    settings: list[str] | None = shared.SETTINGS,  # noqa: ARG001 (a field of the request)
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
@@ -352,16 +329,8 @@ def slam(
     Each scan is matched against a map that grows from scan to scan.
     """
     from omnibench.cli.terminal.recording_tables import print_slam
-    from omnibench.config import parse_settings, validate
-    from omnibench.slam.slam_dataset import SlamRequest
-    from omnibench.slam.slam_options import SlamOptions
 
     shared.load_given_plugins(plugins)
-    given: dict[str, Any] = {} if start is None else {"start": start}
-    given |= {"deskew": False} if no_deskew else {}
-    request = SlamRequest(
-        dataset, output, validate(SlamOptions, parse_settings(settings) | given, "slam --set"), model, truth, force
-    )
     page.refuse(force=force)
     if output is None and not page.asked and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
@@ -388,22 +357,12 @@ def slam(
     return print_ending(poses, "calibrate with them", "omnibench", "calibrate", output, "-o", "calibration.yaml")
 
 
-@recording_app.command()
+@recording_app.command(cls=shared.ModelCommand)
 @shared.grouped
 def simulate(
     output: Path = output_option("Data set folder to write.", default=...),
-    config: Path | None = argument("Config with a simulated data set."),
-    truth: Path | None = option(
-        "Folder for the truth: matrix, effects, true poses. Default: not written.", metavar="DIR"
-    ),
-    dataset: str | None = shared.WHICH_DATASET,
-    effects: list[str] | None = option(
-        "Add an effect, 'name: {parameter: value}'; may be repeated.", "--effect", metavar="YAML"
-    ),
-    like: Path | None = option("Instead of CONFIG: drive this data set's recorded wheel rates.", metavar="DATASET"),
-    model: Path | None = option("With --like: the true model, a calibration file.", metavar="CALIBRATION"),
-    noise: bool = flag("With --like: add the noise that the calibration states.", "--noise"),
-    seed: int | None = option("With --noise: its seed. Default: 0.", min=0),
+    config: Path | None = argument("Config with a simulated data set."),  # noqa: ARG001 (a field of the request)
+    request: "SimulationRequest" = options_of("omnibench.simulate.source:SimulationRequest"),
     table_format: shared.TableFormat = shared.TABLE_FORMAT,
     page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
     force: bool = shared.FORCE,
@@ -413,10 +372,6 @@ def simulate(
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
-    from omnibench.simulate.source import SimulationRequest
-
-    hidden = tuple(effects or ())
-    request = SimulationRequest(output, config, truth, dataset, hidden, like, model, noise, seed, force)
     page.refuse(force=force)
     shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
@@ -436,8 +391,8 @@ def simulate(
         from omnibench.cli.terminal.recording_tables import print_slam_accuracy
 
         print_slam_accuracy(make_console(), made.accuracy)
-    if truth is not None:
-        typer.echo(f"truth: {truth / 'truth.yaml'}")
+    if request.truth is not None:
+        typer.echo(f"truth: {request.truth / 'truth.yaml'}")
     if page.report is not None:
         typer.echo(f"report: {page.report}")
     typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")

@@ -240,60 +240,84 @@ _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that l
 ASSUMED_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
 
 
-@dataclass(frozen=True)
-class RobotOptions:
-    """Options of ``omnibench design --robot``, named as on the command line; None: not given."""
-
-    max_speed: float | None = None
-    max_turn_rate: float | None = None
-    max_wheel_rate: float | None = None
-    steering_limit: float | None = None
-    area: str | None = None
-    position_noise: float | None = None
-    heading_noise: float | None = None
+_OF_ROBOTS = (
+    "max_speed", "max_turn_rate", "max_wheel_rate", "steering_limit", "area", "position_noise", "heading_noise"
+)  # fmt: skip
 
 
-def design_source(
-    source: Path | None,
-    robot: Path | None,
-    options: RobotOptions,
-    *,
-    dataset: str | None = None,
-    integration: Integration | None = None,
-) -> Path | CandidatePool:
-    """What to design from: a data set or config, or the candidates of a robot's file.
+class DesignRequest(Model):
+    """What ``omnibench design`` was asked for: a data set or config, or a robot's file; None: not given."""
 
-    dataset, integration: see ``read_candidates``. ConfigError in one line: both or neither are given, options that go
-    with the other, or a value that cannot be.
-    """
-    given = {name: value for name, value in vars(options).items() if value is not None}
-    for name, value in given.items():
-        option = f"--{name.replace('_', '-')}"
+    source: Path | None = None
+    use: Use = Field(
+        "trajectory", description="Reference poses to calibrate from: all of a run's, or only its final one."
+    )
+    per: Per = Field("run", description="Effort to keep small: runs, time or distance.")
+    runs: int | None = Field(None, ge=1, description="Runs to choose. Default: the fewest within 1 % of the optimum.")
+    repetitions: int | None = Field(None, ge=1, description="How often a command may be chosen at most.")
+    dataset: str | None = Field(None, description="Name of the data set, if the config has several.")
+    integration: Integration | None = Field(
+        None, description="Path within a sample; see calibrate. Default: the config's, or arc for a data set."
+    )
+    robot: Path | None = Field(
+        None, description="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."
+    )
+    max_speed: float | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
+    max_turn_rate: float | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
+    max_wheel_rate: float | None = Field(
+        None, description="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
+    )
+    steering_limit: float | None = Field(
+        None, description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
+    )
+    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
+    position_noise: float | None = Field(
+        None, description="With --robot: of the reference's positions, m. Default: 0.005."
+    )
+    heading_noise: float | None = Field(
+        None, description="With --robot: of the reference's headings, deg. Default: 0.3."
+    )
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """The keyword arguments of ``design_experiment``."""
+        return self.model_dump(include={"use", "per", "runs", "repetitions", "dataset", "integration"})
+
+    def candidates(self) -> Path | CandidatePool:
+        """What to design from: a data set or config, or the candidates of a robot's file.
+
+        ConfigError in one line: both or neither are given, options that go with the other, or a value that cannot be.
+        """
+        robot = self.robot
+        given: dict[str, Any] = self.model_dump(include=set(_OF_ROBOTS), exclude_none=True)
+        for name, value in given.items():
+            option = f"--{name.replace('_', '-')}"
+            if robot is None:
+                raise ConfigError(f"{option}: is for --robot FILE, a design without a recording")
+            if name != "area" and not 0 < value < _MOST.get(name, math.inf):
+                below = f" and below {_MOST[name]:g}" if name in _MOST else ""
+                raise ConfigError(f"{option} {value:g}: must be above 0{below}")
         if robot is None:
-            raise ConfigError(f"{option}: is for --robot FILE, a design without a recording")
-        if name != "area" and not 0 < value < _MOST.get(name, math.inf):
-            below = f" and below {_MOST[name]:g}" if name in _MOST else ""
-            raise ConfigError(f"{option} {value:g}: must be above 0{below}")
-    if robot is None:
-        if source is None:
-            raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
-        return source
-    if source is not None:
-        raise ConfigError(f"--robot {robot}: designs without {source}; give one of them")
-    refuse_choice(dataset, robot)
-    noise = ASSUMED_NOISE.model_dump()
-    noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
-    noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
-    if "area" in given:
-        text = given["area"]  # the sides, m, like 3x2.5
-        match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
-        given["area"] = sides = tuple(map(float, match.groups())) if match else (0.0, 0.0)
-        if min(sides) <= 0 or not math.isfinite(max(sides)):
-            raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
-    if "steering_limit" in given:
-        given["steering_limit_deg"] = given.pop("steering_limit")
-    content = {"robot": str(robot), "noise": noise, **given}
-    return validate(RobotCommands, content, f"design --robot {robot}").pool(str(robot), integration or "arc")
+            if self.source is None:
+                raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
+            return self.source
+        if self.source is not None:
+            raise ConfigError(f"--robot {robot}: designs without {self.source}; give one of them")
+        refuse_choice(self.dataset, robot)
+        noise = ASSUMED_NOISE.model_dump()
+        noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
+        noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
+        if "area" in given:
+            text = given["area"]  # the sides, m, like 3x2.5
+            match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
+            given["area"] = sides = tuple(map(float, match.groups())) if match else (0.0, 0.0)
+            if min(sides) <= 0 or not math.isfinite(max(sides)):
+                raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
+        if "steering_limit" in given:
+            given["steering_limit_deg"] = given.pop("steering_limit")
+        content = {"robot": str(robot), "noise": noise, **given}
+        commands = validate(RobotCommands, content, f"design --robot {robot}")
+        return commands.pool(str(robot), self.integration or "arc")
 
 
 class RobotCommands(Model):

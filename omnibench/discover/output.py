@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from pydantic import Field
 
 from omnibench import files
 from omnibench.config import Model, to_json, to_yaml
@@ -20,14 +21,16 @@ _MARK = "# The effective options of a discovery; the results beside it were made
 
 
 class DiscoverOptions(Model):
-    """The options of a discovery: the content of its config.yaml."""
+    """The options of ``omnibench discover``, and the content of its config.yaml."""
 
-    dataset: str
-    model: str | None = None
-    without: tuple[str, ...] = ()
-    unknown_term: bool = True
-    seed: int = 0
-    plugins: tuple[str, ...] = ()
+    dataset: Path
+    model: Path | None = Field(None, description="Start from this calibration. Default: fit a matrix.")
+    without: tuple[str, ...] = Field((), description="Effect not to try; may be repeated.")
+    unknown_term: bool = Field(
+        True, description="Where no name is sure, close the gap all the same, by a term without a name."
+    )
+    seed: int = Field(0, ge=0, description="Seed of the random numbers.")
+    plugins: tuple[Path, ...] = ()
 
 
 def check_output(folder: Path | None, options: DiscoverOptions, *, force: bool = False) -> None:

@@ -37,7 +37,7 @@ class CostChoice(Model):
 class FitSettings(Model):
     """Every choice of a fit. ``calibrate`` fills fields that are None with defaults for the robot and its runs.
 
-    ``omnibench calibrate --help`` prints the descriptions of the fields.
+    The fields are the options of ``omnibench calibrate``, with their descriptions.
     """
 
     calibrator: str | None = Field(

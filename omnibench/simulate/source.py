@@ -264,27 +264,27 @@ class WrittenSimulation:
     accuracy: SlamAccuracy | None = None
 
 
-@dataclass(frozen=True)
-class SimulationRequest:
-    """Arguments of ``omnibench simulate``: either ``config``, or ``like`` with ``model``.
+class SimulationRequest(Model):
+    """What ``omnibench simulate`` was asked for: either ``config``, or ``like`` with ``model``.
 
-    effects: to hide besides those of the config, each as YAML. noise: add the calibration's noise (with ``like``).
-    seed: of that noise; default 0. force: replace what is there. ConfigError in one line: options that exclude each
-    other.
+    ConfigError in one line: options that exclude each other.
     """
 
     output: Path
     config: Path | None = None
-    truth: Path | None = None
-    dataset: str | None = None
-    effects: tuple[str, ...] = ()
-    like: Path | None = None
-    model: Path | None = None
-    noise: bool = False
-    seed: int | None = None
+    truth: Path | None = Field(
+        None, description="Folder for the truth: matrix, effects, true poses. Default: not written."
+    )
+    dataset: str | None = Field(None, description="Name of the data set, if the config has several.")
+    effect: tuple[str, ...] = Field((), description="Add an effect, 'name: {parameter: value}'; may be repeated.")
+    like: Path | None = Field(None, description="Instead of CONFIG: drive this data set's recorded wheel rates.")
+    model: Path | None = Field(None, description="With --like: the true model, a calibration file.")
+    noise: bool = Field(False, description="With --like: add the noise that the calibration states.")
+    seed: int | None = Field(None, ge=0, description="With --noise: its seed. Default: 0.")
     force: bool = False
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _go_together(self) -> SimulationRequest:
         if self.like is None and self.model is None:
             if self.config is None:
                 raise ConfigError("name a CONFIG with a simulated data set, or --like DATASET --model CALIBRATION")
@@ -296,7 +296,7 @@ class SimulationRequest:
             raise ConfigError(f"--like {self.like}: say with --model CALIBRATION by which model")
         else:
             of_configs: dict[str, object] = {f"CONFIG {self.config}": self.config, "--truth": self.truth}
-            of_configs |= {"--dataset": self.dataset, "--effect": self.effects or None}
+            of_configs |= {"--dataset": self.dataset, "--effect": self.effect or None}
             _refuse(of_configs, "does not go with --like, which takes all from the recording and the calibration")
             if self.seed is not None and not self.noise:
                 raise ConfigError("--seed: is for --noise, which is not asked for; add --noise, or leave --seed out")
@@ -304,12 +304,13 @@ class SimulationRequest:
                 raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
         if self.truth is not None and resolved(self.truth).is_relative_to(resolved(self.output)):
             raise ConfigError("--truth: must be a folder apart from the data set's")
+        return self
 
     @cached_property
     def source(self) -> SimulationSource:
         """The config's data set, with the effects. ConfigError as for ``read_simulation``."""
         assert self.config is not None
-        return read_simulation(self.config, self.dataset).with_effects(self.effects)
+        return read_simulation(self.config, self.dataset).with_effects(self.effect)
 
     @property
     def plugins(self) -> tuple[Path, ...]:
@@ -332,7 +333,7 @@ class SimulationRequest:
             dataset = simulate_like(load_dataset(self.like), calibration, (self.seed or 0) if self.noise else None)
             save_dataset(dataset, self.output, table_format, overwrite=self.force)
             return WrittenSimulation(dataset)
-        check_effect_options(self.effects)
+        check_effect_options(self.effect)
         simulation = self.source.simulate(watch)
         save_dataset(simulation.dataset, self.output, table_format, overwrite=self.force)
         accuracy = slam_accuracy(simulation.dataset, simulation.paths) if simulation.paths else None

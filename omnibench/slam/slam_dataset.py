@@ -36,18 +36,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from omnibench.config import Model
+from omnibench.config import Model, parse_settings, validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.scans import Ranges, Scanner, TrajectoryScans
 from omnibench.data.storage import check_dataset_folder, load_dataset, save_dataset
@@ -739,27 +739,36 @@ class SlamResult:
     truth: Mapping[str, TruePath] | None
 
 
-@dataclass(frozen=True)
-class SlamRequest:
-    """Arguments of ``omnibench slam``.
+class SlamRequest(Model):
+    """What ``omnibench slam`` was asked for. settings: of SlamOptions, as KEY=VALUE.
 
-    dataset: folder of the recording. output: folder to write with the new poses; None: none. model: a calibration file,
-    whose odometry the search starts from; None: the design values. truth: the folder that ``simulate --truth`` wrote.
-    force: replace the data set that is in ``output``. ConfigError in one line: the recording would be written over.
+    ConfigError in one line: an option is wrong, or the recording would be written over.
     """
 
     dataset: Path
     output: Path | None = None
-    options: SlamOptions = field(default_factory=SlamOptions)
-    model: Path | None = None
-    truth: Path | None = None
+    start: Literal["odometry", "last_pose"] | None = Field(
+        None, description="First guess of each scan's pose. Default: odometry."
+    )
+    no_deskew: bool = Field(False, description="Leave out the correction for the robot's motion during a scan.")
+    model: Path | None = Field(None, description="Calibration for that odometry. Default: the design values.")
+    truth: Path | None = Field(None, description="Folder that simulate --truth wrote: show the errors against it.")
+    settings: tuple[str, ...] = ()
     force: bool = False
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def options(self) -> SlamOptions:
+        """The options of SLAM, by ``settings`` and by those that have an option of their own."""
+        given = parse_settings(self.settings) | ({} if self.start is None else {"start": self.start})
+        return validate(SlamOptions, given | ({"deskew": False} if self.no_deskew else {}), "slam --set")
+
+    @model_validator(mode="after")
+    def _go_together(self) -> SlamRequest:
         if self.output is not None and resolved(self.output) == resolved(self.dataset):
             raise ConfigError(f"-o {self.output}: is the recording itself; name another folder")
-        if self.model is not None and self.options.start != "odometry":
+        if self.options.start != "odometry" and self.model is not None:
             raise ConfigError(f"--model {self.model}: is for --start odometry; leave one of the two out")
+        return self
 
     def run(self, watch: Reporter = no_progress, table_format: TableFormat = "parquet") -> SlamResult:
         """Find the poses and write the data set. DataError in one line, before the work where that can be.

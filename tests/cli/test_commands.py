@@ -1,8 +1,10 @@
 """What each command prints and leaves behind: documents on standard output, files, plug-ins."""
 
 import json
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +218,19 @@ def test_list_names_everything_that_a_config_can_name(command: Command) -> None:
     assert origins["crs"] == "built in"
     assert origins["cmaes"] == str(CONFIGS.parent / "plugins" / "cmaes.py")
     assert found["failures"] == []
+    assert document(command("list", "costs", "--json")) == {"costs": found["costs"], "failures": []}
+
+
+def test_list_shows_the_names_of_all_kinds_in_forty_lines(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    printed = command("list", "--plugins", CONFIGS.parent / "plugins")
+    assert len((printed.stdout + printed.stderr).splitlines()) <= 40
+    assert all(len(line) <= 80 for line in printed.stdout.splitlines())
+    found = document(command("list", "--plugins", CONFIGS.parent / "plugins", "--json"))
+    for kind in ("calibrators", "costs", "effects", "importers"):
+        assert f"{kind} ({len(found[kind])})" in printed.stdout
+        assert {row["name"] for row in found[kind]} <= {*re.findall(r"\w+", printed.stdout)}
 
 
 def test_list_takes_the_plugins_of_the_folder_one_is_in(command: Command, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ _WITHOUT_TABLES = (
 )
 _QUICK = (
     ("list", "--plugins", "none"),
+    ("list", "effects", "--plugins", "none"),
     ("calibrate", "{data}"),
     ("evaluate", "{calibration}", "{data}"),
     ("inspect", "{swerve}"),
@@ -156,7 +157,8 @@ def test_the_help_of_no_command_is_cut_in_eighty_columns(command: Command, monke
 def test_every_command_and_each_of_its_options_says_what_it_is(name: str) -> None:
     described = commands()[name]
     assert described.help
-    assert [parameter.name for parameter in described.params if not parameter.help and parameter.name != "help"] == []
+    parameters = described.get_params(described.make_context(name, [], resilient_parsing=True))
+    assert [parameter.name for parameter in parameters if not parameter.help and parameter.name != "help"] == []
 
 
 @pytest.mark.parametrize("name", commands())

@@ -422,19 +422,17 @@ def test_a_design_config_lists_commands_for_a_robot_that_steers_within_its_limit
 )
 def test_what_cannot_be_is_refused_by_name(name: str, given: dict[str, object], words: str, tmp_path: Path) -> None:
     with refused(ConfigError, words):
-        candidates.design_source(None, file_of(tmp_path, name), candidates.RobotOptions(**given))  # type: ignore[arg-type]
+        candidates.DesignRequest(robot=file_of(tmp_path, name), **given).candidates()
 
 
 @pytest.mark.parametrize(
-    ("data", "file", "options", "name"),
+    ("given", "name"),
     [
-        ("data", "robot.yaml", candidates.RobotOptions(), "--robot robot.yaml"),
-        ("data", None, candidates.RobotOptions(max_speed=1.0), "--max-speed"),
-        (None, None, candidates.RobotOptions(), "--robot FILE"),
+        ({"source": "data", "robot": "robot.yaml"}, "--robot robot.yaml"),
+        ({"source": "data", "max_speed": 1.0}, "--max-speed"),
+        ({}, "--robot FILE"),
     ],
 )
-def test_a_robot_excludes_a_recording(
-    data: str | None, file: str | None, options: candidates.RobotOptions, name: str
-) -> None:
+def test_a_robot_excludes_a_recording(given: dict[str, Any], name: str) -> None:
     with pytest.raises(ConfigError, match=name):
-        candidates.design_source(data and Path(data), file and Path(file), options)
+        candidates.DesignRequest(**given).candidates()

@@ -707,7 +707,7 @@ def test_an_effect_is_made_checked_and_listed_on_the_command_line(command: Comma
     checked = succeeded(command("plugin", "check", "plugins/first_slip.py"))
     assert "passed  effect first_slip: it is linear in its parameters" in checked.stdout
     assert_refused(command("plugin", "new", "slip", "--effect", "--kind", "cost"), "--effect", "--kind cost")
-    listed = command("list").stdout
+    listed = command("list", "effects").stdout
     row = next(line for line in listed.splitlines() if "second_slip" in line)
     assert "The faster the robot drives" in row
     assert "second_slip.py" in "".join(listed.split())  # a long path is broken

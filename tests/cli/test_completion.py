@@ -1,0 +1,50 @@
+"""Tab completion, as the shell asks for it: names of commands, options, and whatever an option or an argument names."""
+
+from pathlib import Path
+
+import pytest
+from commands import ENVIRONMENT, ROOT, python, succeeded
+
+PROGRAM = "import sys; sys.argv[0] = 'omnibench'; from omnibench.__main__ import main; main()"
+
+
+def completed(typed: str, folder: Path) -> set[str]:
+    """What bash is told to offer for the last word of a line."""
+    line = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_OMNIBENCH_COMPLETE": "complete_bash"}
+    return set(
+        succeeded(python(PROGRAM, cwd=folder, env=ENVIRONMENT | line | {"PYTHONPATH": str(ROOT)})).stdout.split()
+    )
+
+
+@pytest.mark.parametrize(
+    ("typed", "names"),
+    [
+        ("omnibench cal", {"calibrate"}),
+        ("omnibench calibrate --para", {"--parameterisation"}),
+        ("omnibench calibrate --calibrator cl", {"closed_form"}),
+        ("omnibench calibrate --cost traj", {"trajectory"}),
+        ("omnibench calibrate --box ", {"paper", "row"}),
+        ("omnibench discover data --without heading_d", {"heading_drift"}),
+        ("omnibench simulate --effect heading_d", {"heading_drift"}),
+        ("omnibench import ros", {"rosbag"}),
+        ("omnibench check data --format ros", {"rosbag"}),
+        ("omnibench export c.yaml --to c", {"c_header"}),
+        ("omnibench fetch omni", {"omni3", "omni4"}),
+        ("omnibench example sm", {"small"}),
+        ("omnibench guide importi", {"importing"}),
+        ("omnibench list eff", {"effects"}),
+    ],
+)
+def test_a_name_is_completed(typed: str, names: set[str], tmp_path: Path) -> None:
+    assert completed(typed, tmp_path) == names
+
+
+def test_no_plug_in_runs_while_somebody_types(tmp_path: Path) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "loud.py").write_text("raise SystemExit('it ran')\n", encoding="utf-8")
+    assert "closed_form" in completed("omnibench calibrate --calibrator ", tmp_path)
+
+
+def test_the_script_of_a_shell_is_shown(tmp_path: Path) -> None:
+    shown = succeeded(python(PROGRAM, "--show-completion", cwd=tmp_path, env=ENVIRONMENT | {"SHELL": "/bin/bash"}))
+    assert "_OMNIBENCH_COMPLETE=complete_bash" in shown.stdout
