@@ -84,14 +84,12 @@ def open_backend(
         finally:
             processes.close()
         return
-    from omnibench.jobs.dask_backend import DaskBackend, checked_requirements, dask_client, say_cluster
+    from omnibench.jobs.dask_backend import DaskBackend, dask_client
 
     address = None if choice.name == "dask" else choice.name
     with dask_client(address, choice.workers, choice.tls, report) as client:
-        backend = DaskBackend(client, checked_requirements(client, preload), report)
         if choice.name.startswith("tcp:"):
             risk = f"whoever reaches {choice.name} runs code on its workers and here"
             way_out = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
             report(Progress("tcp", result=f"warning: {risk}; {way_out}"))
-        say_cluster(client, report)
-        yield backend
+        yield DaskBackend(client, preload, report)
