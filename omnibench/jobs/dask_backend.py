@@ -1,20 +1,18 @@
-"""Backend of a Dask cluster: of this machine's processes, or one that an address joins, with its workers checked.
+"""Backend of a Dask cluster: of this machine's processes, or one that an address joins.
 
-Each job is a task, and its end is the task's result. That it begins and moves are events from its worker, in JSON. A
-worker that is killed takes its jobs with it, and they are given to others. Their begins are counted here, since the
-scheduler also counts jobs that only waited there. (A scheduler that was not started here tries again by itself, by its
-own setting ``allowed-failures``, before this hears of it.)
+Some quick jobs, or one that is not, are a task, and their ends its result. A worker has a task for each of its threads
+and none that waits, so that a worker that is killed takes only jobs that it had begun. They are tried again like jobs
+whose process was killed. (A scheduler that was not started here tries again by itself, by its own setting
+``allowed-failures``.)
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import pickle
 import time
 import warnings
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -32,11 +30,10 @@ from distributed import KilledWorker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError, connect
 from distributed.core import send_recv
-from pydantic import TypeAdapter
 
 from omnibench.errors import ConfigError, OmnibenchError, one_line
 from omnibench.jobs import dask_worker
-from omnibench.jobs.job import TRIES, BackendError, Failure, Job, JobEnd, JobWatch, TlsFiles
+from omnibench.jobs.job import BackendError, Failure, Job, JobEnd, JobWatch, TlsFiles
 from omnibench.jobs.job_process import Packer
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter, no_progress
@@ -47,25 +44,23 @@ T = TypeVar("T")
 
 _CLIENT_CLOSED, _CLUSTER_CLOSED = 1.0, 5.0  # s in which they must have closed; chosen
 _ANSWER = 10.0  # s in which a scheduler must answer; chosen
-# s in which a worker must have joined, or be there again, and a scheduler at work must answer: workers of a batch
-# system start with the first job (chosen).
+# s in which a worker must be there, or there again, and a scheduler at work must answer: workers of a batch system
+# start with the first job (chosen).
 WAIT = 60.0
 _SETTINGS = {
-    "distributed.scheduler.allowed-failures": 0,  # the backend tries again: it knows which jobs had begun
+    "distributed.scheduler.allowed-failures": 0,  # ``run_jobs`` tries again, after all other jobs
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
     "distributed.worker.memory.terminate": False,  # limits are those of jobs
     "distributed.worker.profile.enabled": False,  # nobody looks at it, and quick jobs pay for it
     "distributed.admin.low-level-log-length": 10,  # copies of messages, which nobody reads
     "distributed.admin.tick.interval": "500 ms",
-    "distributed.comm.timeouts.connect": f"{WAIT} s",  # workers of a busy machine take long to join
+    "distributed.comm.timeouts.connect": f"{WAIT} s",  # workers take long to join on a busy machine
     "distributed.deploy.lost-worker-timeout": f"{WAIT} s",  # a worker here that was killed is started again until then
 }
-_STARTS = 3  # tries to start a cluster: a worker may be killed as it starts; chosen
-_AHEAD = 2  # jobs a slot that are with the cluster: one at work, one that waits for it (chosen)
+_STARTS = 3  # tries to start a cluster here, as a worker may be killed while it starts; chosen
 _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
 _BATCH, _LARGEST_BATCH = 0.2, 50  # s of work, and jobs, that travel together: a task costs 5 ms in all; chosen
 _WEIGHT = 0.1  # weight of the latest job's time in the running mean; chosen
-_SUBMISSIONS = 10  # times that a job is sent whose workers die before it begins: chosen, as it is no fault of its own
 
 
 class ClusterLostError(BackendError):
@@ -75,47 +70,17 @@ class ClusterLostError(BackendError):
 
 
 @contextmanager
-def _lost_if_closed(client: Any) -> Iterator[None]:
-    """Turn the end of the connection, at whatever question it is seen, into ClusterLostError."""
-    try:
-        yield
-    except (CommClosedError, FutureCancelledError, TimeoutError):  # TimeoutError: it is frozen, or its machine is gone
-        raise ClusterLostError(
-            f"the Dask scheduler {client.scheduler.address} is lost; start it again, then the same command"
-        ) from None
-
-
-class _PackedClient(distributed.Client):
-    """Client that leaves packed what others publish at the scheduler: distributed's own unpickles it, thus runs it."""
-
-    async def _ensure_connected(self, timeout: Any = None) -> None:
-        parent: Any = super()  # without types
-        await parent._ensure_connected(timeout)
-        if self.scheduler_comm is not None:
-            self.scheduler_comm.comm.deserialize = False
-
-    def _handle_task_erred(self, key: Any = None, exception: Any = None, traceback: Any = None) -> None:
-        if key in self.futures:  # a task of this client
-            parent: Any = super()
-            parent._handle_task_erred(key, *_protocol.loads(_protocol.dumps([exception, traceback])))
-
-
-_Client: Any = _PackedClient
-_protocol: Any = distributed.protocol
-
-
-@contextmanager
-def dask_client(address: str | None, workers: int, tls: TlsFiles | None, report: Reporter) -> Iterator[Any]:
+def dask_client(address: str | None, workers: int, tls: TlsFiles | None) -> Iterator[Any]:
     """A client of the scheduler at ``address``, or of a cluster of so many processes that is started here.
 
-    Its workers are not checked yet. ConfigError: nobody answers there, or a scheduler of another version.
+    ConfigError: nobody answers there, or a scheduler of another version. ClusterLostError: no cluster starts here.
     """
     # What goes wrong is said once, in words. The client of a lost scheduler goes on complaining until the process ends.
     for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # each has a level of its own
     with warnings.catch_warnings(), dask.config.set(_SETTINGS):
         warnings.filterwarnings("ignore", module="distributed")
-        with _local_client(workers) if address is None else _joined_client(address, tls, report) as client:
+        with _local_client(workers) if address is None else _closing(_joined(address, tls), _CLIENT_CLOSED) as client:
             yield client
 
 
@@ -133,36 +98,32 @@ def _closing(opened: Any, seconds: float) -> Iterator[Any]:
 def _local_client(workers: int) -> Iterator[Any]:
     """A client of a cluster of this machine's processes, which leave Ctrl-C to this one."""
     resource_tracker.ensure_running()  # the first worker would start it, and unblock what is blocked
+    # The cluster has certificates of its own: other users of this machine cannot join.
+    options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": None, "security": True}
     with main_module_hidden():  # a worker that died is started again at any time
-        cluster = None
-        for tried in range(1, _STARTS + 1):
+        cluster, tried = None, 0
+        while cluster is None:
+            tried += 1
             try:
                 with interrupts_blocked():
                     cluster = distributed.LocalCluster(
-                        n_workers=workers,
-                        threads_per_worker=1,
-                        security=True,  # certificates of its own: other users of this machine cannot join
-                        memory_limit=None,
-                        dashboard_address="127.0.0.1:8787",
-                        silence_logs=logging.CRITICAL,
+                        **options, dashboard_address="127.0.0.1:8787", silence_logs=logging.CRITICAL
                     )
-                break
             except (RuntimeError, OSError) as error:
                 if tried == _STARTS:
                     raise ClusterLostError(
-                        f"the workers of Dask here do not start ({one_line(str(error))}), in {_STARTS} tries; free "
-                        "memory or take fewer --workers, then the same command"
+                        f"no workers of Dask start here ({one_line(str(error))}), in {_STARTS} tries; free memory or "
+                        "take fewer workers, then the same command"
                     ) from None
         with (
             _closing(cluster, _CLUSTER_CLOSED),
-            _closing(_Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
+            _closing(distributed.Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
         ):
             yield client
 
 
-@contextmanager
-def _joined_client(address: str, tls: TlsFiles | None, report: Reporter) -> Iterator[Any]:
-    """A client of a scheduler that runs already, once it has a worker."""
+def _joined(address: str, tls: TlsFiles | None) -> Any:
+    """A client of a scheduler that runs already."""
     security = None
     if tls is not None:
         security = distributed.Security(
@@ -170,8 +131,17 @@ def _joined_client(address: str, tls: TlsFiles | None, report: Reporter) -> Iter
         )
     try:
         with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
-            thread.submit(asyncio.run, _ask(address, security)).result()
-        joined = _Client(address, timeout=_ANSWER, set_as_default=False, security=security)
+            kind = thread.submit(asyncio.run, _kind(address, security)).result()
+        if kind != "Scheduler":
+            raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
+        client: Any = distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
+        there, here = (
+            client.get_versions()["scheduler"]["packages"]["distributed"],
+            dask_worker.software()["distributed"],
+        )
+        if there != here:
+            client.close(timeout=_CLIENT_CLOSED)
+            raise ConfigError(f"scheduler {address} has distributed {there} (here: {here}); install the same")
     except ConfigError:
         raise
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
@@ -179,31 +149,11 @@ def _joined_client(address: str, tls: TlsFiles | None, report: Reporter) -> Iter
         raise ConfigError(
             f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"
         ) from None
-    with _closing(joined, _CLIENT_CLOSED) as client, _lost_if_closed(client):
-        packages = client.get_versions()["scheduler"]["packages"]
-        there, here = (
-            {name: versions[name] for name in ("dask", "distributed") if name in versions}
-            for versions in (packages, dask_worker.software())
-        )
-        if wrong := dask_worker.differences(there, here):
-            raise ConfigError(f"scheduler {address} has {', '.join(wrong)}; install the same on both sides")
-        if not client.nthreads():
-            report(Progress("waiting for a worker"))
-            try:
-                client.wait_for_workers(1, timeout=WAIT)
-            except TimeoutError:
-                raise ConfigError(
-                    f"no worker has joined the scheduler {address} for {WAIT:g} s; start some (dask worker {address})"
-                ) from None
-            report(Progress("waiting for a worker", result=""))
-        yield client
+    return client
 
 
-async def _ask(address: str, security: Any) -> None:
-    """Ask who listens. A client waits without end where it is no scheduler, but a web server or a worker.
-
-    ConfigError: a worker, or another part of Dask.
-    """
+async def _kind(address: str, security: Any) -> str:
+    """The kind of who listens. A client waits without end where it is no scheduler, but a web server or a worker."""
     place = urlsplit(address)
     await asyncio.get_running_loop().getaddrinfo(place.hostname, place.port)  # an unknown host is said at once
     arguments = {} if security is None else security.get_connection_args("client")
@@ -212,8 +162,7 @@ async def _ask(address: str, security: Any) -> None:
         identity = await asyncio.wait_for(send_recv(comm, op="identity", reply=True), _ANSWER)
     finally:
         comm.abort()
-    if (kind := identity["type"]) != "Scheduler":
-        raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
+    return str(identity["type"])
 
 
 class DaskBackend:
@@ -225,10 +174,8 @@ class DaskBackend:
 
     def __init__(self, client: Any, preload: Sequence[str], report: Reporter = no_progress) -> None:
         self.client, self._report = client, report
-        self.topic = f"omnibench-{uuid4().hex[:12]}"
-        self.news: SimpleQueue[object] = SimpleQueue()  # texts of events, and futures that are done
         self._packer = Packer()
-        self._data: dict[str, Any] = {}
+        self._data: dict[str, Any] = {}  # futures, by name
         self._without: float | None = None  # time since which there has been no worker
         plugins = loaded_plugin_files()
         self._requirements = pickle.dumps(
@@ -248,8 +195,6 @@ class DaskBackend:
                 raise dask_worker.UnfitWorkerError(
                     f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there"
                 )
-        put = self.news.put  # the client keeps what handles a topic, even when it is heard no more
-        client.subscribe_topic(self.topic, lambda event: put(event[1]))
         page = client.dashboard_link
         if find_spec("bokeh") is None:  # which the dashboard needs; these pages do not
             page = page.replace("/status", "/info/main/workers.html")
@@ -260,69 +205,64 @@ class DaskBackend:
     ) -> Generator[tuple[int, Job[T], JobEnd], None, None]:
         """Run the jobs, see Backend. ClusterLostError, or UnfitWorkerError of a worker that joined later."""
         waiting = iter(jobs)
-        active: dict[str, tuple[Any, dict[int, Job[T]]]] = {}  # by the key of the task: its future and jobs
-        begins, submissions = Counter[int](), Counter[int]()
-        seconds = _BATCH  # a job takes about so long
-
-        def submit(batch: dict[int, Job[T]]) -> None:
-            submissions.update(list(batch))
-            packed = tuple((number, self._packer.pack(job)) for number, job in batch.items())
-            names = tuple({name: None for _, job in packed for name in job.names})
-            timed = any(job.timed for job in batch.values())
-            future = self.client.submit(
-                dask_worker.carry_out,
-                dask_worker.Batch(packed, names, encode, timed, self.topic),
-                self._content("requirements", self._requirements),
-                *(self._content(name, self._packer.shared[name]) for name in names),
-                key=f"{self.topic}-{uuid4().hex[:12]}",
-                pure=False,
-            )
-            active[future.key] = future, batch
-            future.add_done_callback(self.news.put)
-
-        with _lost_if_closed(self.client):
-            slots, looked = self._slots(), time.monotonic()
-            try:
-                while True:
-                    size = min(max(int(_BATCH / max(seconds, 1e-6)), 1), _LARGEST_BATCH)
-                    while len(active) < _AHEAD * slots and (batch := dict(islice(waiting, size))):
-                        submit(batch)
-                    if not active:
-                        return
-                    if time.monotonic() - looked >= _LOOK:
-                        slots, looked = self._slots(), time.monotonic()
-                    try:
-                        news = self.news.get(timeout=_LOOK)
-                    except Empty:
-                        continue
-                    if not isinstance(news, distributed.Future):
-                        key, number, event = _read_event(news)
-                        _, batch = active.get(key, (None, {}))  # none: of a call that was interrupted
-                        if event is None:
-                            begins.update(list(batch))
-                            for number in batch:
-                                watch.began(number)
-                        elif number in batch:
-                            watch.moved(number, event)
-                    elif str(news.key) in active:
-                        future, batch = active.pop(str(news.key))
-                        if (error := _error(future)) is None:
-                            ends, spent = future.result()
-                            seconds += _WEIGHT * (spent / len(batch) - seconds)
-                            for number, end in ends:
-                                yield number, batch[number], end
+        alone: list[dict[int, Job[T]]] = []  # jobs of batches whose worker was killed
+        active: dict[Any, dict[int, Job[T]]] = {}  # jobs by their task's future
+        done: SimpleQueue[Any] = SimpleQueue()  # futures
+        slots, looked, seconds = self._slots(), time.monotonic(), _BATCH
+        try:
+            while True:
+                size = min(max(int(_BATCH / max(seconds, 1e-6)), 1), _LARGEST_BATCH)
+                while len(active) < slots and (batch := alone.pop() if alone else dict(islice(waiting, size))):
+                    future = self._submit(batch, encode)
+                    active[future] = batch
+                    future.add_done_callback(done.put)
+                    for number in batch:
+                        watch.began(number)
+                if not active:
+                    return
+                with suppress(Empty):
+                    future = done.get(timeout=_LOOK)
+                    batch, error = active.pop(future), future.status == "error" and future.exception()
+                    if isinstance(error, KilledWorker):
+                        looked = 0.0
+                        if len(batch) > 1:
+                            alone += [{number: job} for number, job in batch.items()]
                             continue
+                        # A scheduler that was not started here has tried again by itself.
+                        tries = error.allowed_failures and f" in each of {error.allowed_failures + 1} tries"
+                        reason = f"its worker {error.last_worker.address} was killed{tries or ''}"
                         for number, job in batch.items():
-                            if begins[number] < TRIES and submissions[number] < _SUBMISSIONS:
-                                submit({number: job})
-                            else:
-                                tries = f"in each of {begins[number]} tries" if begins[number] else "before it began"
-                                reason = f"its worker was killed {tries} (the last: {error.last_worker.address})"
-                                yield number, job, JobEnd(failure=Failure(reason))
-            finally:
-                if self.client.status == "running" and active:
-                    with suppress(OSError):  # a scheduler that does not answer in time
-                        self.client.cancel([future for future, _ in active.values()], force=True)
+                            yield number, job, JobEnd(failure=Failure(reason, killed=not tries))
+                    elif isinstance(error, OmnibenchError):
+                        raise error  # a worker joined later and is unfit
+                    elif error:
+                        reason = one_line(f"{type(error).__name__}: {error}")
+                        raise BackendError(f"a Dask worker failed ({reason}); start it again")
+                    else:
+                        ends, spent = future.result()
+                        seconds += _WEIGHT * (spent / len(batch) - seconds)
+                        for number, end in ends:
+                            yield number, batch[number], end
+                if time.monotonic() - looked >= _LOOK:
+                    slots, looked = self._slots(), time.monotonic()
+        except (CommClosedError, FutureCancelledError, TimeoutError):  # TimeoutError: it is frozen, or its machine gone
+            address = self.client.scheduler.address
+            raise ClusterLostError(
+                f"the Dask scheduler {address} is lost; start it again, then the same command"
+            ) from None
+        finally:
+            if self.client.status == "running" and active:
+                with suppress(OSError):  # a scheduler that does not answer in time
+                    self.client.cancel([*active], force=True)
+
+    def _submit(self, batch: dict[int, Job[T]], encode: Callable[[T], Any]) -> Any:
+        """The future of a batch's task."""
+        packed = tuple((number, self._packer.pack(job)) for number, job in batch.items())
+        names = tuple({name: None for _, job in packed for name in job.names})
+        timed = any(job.timed for job in batch.values())
+        data = [self._content("requirements", self._requirements)]
+        data += [self._content(name, self._packer.shared[name]) for name in names]
+        return self.client.submit(dask_worker.carry_out, packed, names, encode, timed, *data, pure=False)
 
     def _content(self, name: str, value: bytes) -> Any:
         """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
@@ -350,28 +290,3 @@ class DaskBackend:
                 f"(dask worker {address}), then the same command"
             )
         return max(slots, 1)
-
-
-def _error(future: Any) -> KilledWorker | None:
-    """Why the workers of a task that is done were killed; None if it has ended well. BackendError for all else."""
-    if future.status == "finished":
-        return None
-    if future.status != "error":  # the scheduler is gone
-        raise CommClosedError
-    error = future.exception()
-    if isinstance(error, KilledWorker):
-        return error
-    if isinstance(error, OmnibenchError):
-        raise error  # a worker joined later and is unfit
-    raise BackendError(f"a Dask worker failed ({one_line(f'{type(error).__name__}: {error}')}); start it again")
-
-
-def _read_event(text: object) -> tuple[str, int, Progress | None]:
-    """Key of a task, number of a job and its progress (None: all begin); no key for what our workers do not write."""
-    try:
-        return _EVENT.validate_python(json.loads(text) if isinstance(text, str) else None)
-    except (ValueError, RecursionError):  # ValueError: pydantic's errors, too
-        return "", 0, None
-
-
-_EVENT = TypeAdapter(tuple[str, int, Progress | None])

@@ -7,15 +7,14 @@ software that results depend on is compared before the first job.
 from __future__ import annotations
 
 import hashlib
-import json
 import multiprocessing
 import os
 import pickle
 import platform
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points, version
 from pathlib import Path
@@ -27,7 +26,7 @@ from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.jobs.job import BackendError, Job, JobEnd, JobWatch, code_digest
 from omnibench.jobs.job_process import PackedJob, Packer, Processes
-from omnibench.progress import Progress, Reporter
+from omnibench.progress import Reporter
 from omnibench.registry import REGISTRIES, PluginFailure, import_copies
 
 _PACKAGES = (
@@ -73,17 +72,6 @@ class Requirements:
     plugins: Mapping[Path, str]
     failing: frozenset[str]
     preload: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Jobs of one task, by their numbers: quick ones go together, as a task costs 5 ms. names: of what they share."""
-
-    jobs: tuple[tuple[int, PackedJob], ...]
-    names: tuple[str, ...]
-    encode: Callable[[Any], Any]
-    timed: bool
-    topic: str
 
 
 def prepare(requirements: bytes, dask_worker: Any) -> dict[Path, Path]:
@@ -134,15 +122,23 @@ def content(data: bytes) -> bytes:
     return data
 
 
-def carry_out(batch: Batch, requirements: bytes, *shared: bytes) -> tuple[list[tuple[int, JobEnd]], float]:
+def carry_out(
+    jobs: Sequence[tuple[int, PackedJob]],
+    names: Sequence[str],
+    encode: Callable[[Any], Any],
+    timed: bool,
+    requirements: bytes,
+    *shared: bytes,
+) -> tuple[list[tuple[int, JobEnd]], float]:
     """Task of some jobs, one after the other: their ends, and the seconds that they took.
 
-    UnfitWorkerError: this worker joined after the first job, and is not as it must be.
+    names, shared: of what they share, and its contents. timed: they have the worker to themselves. UnfitWorkerError:
+    this worker joined after the first job, and is not as it must be.
     """
     worker: Any = distributed.get_worker()
     key, plugins = worker.get_current_task(), prepare(requirements, worker)
     pool = _processes(threading.get_ident(), pickle.loads(requirements).preload)
-    slots, taken = _slots(worker.state.nthreads), worker.state.nthreads if batch.timed else 1
+    slots, taken = _slots(worker.state.nthreads), worker.state.nthreads if timed else 1
 
     def wanted() -> bool:
         task = worker.state.tasks.get(key)  # none once the client is gone
@@ -152,14 +148,10 @@ def carry_out(batch: Batch, requirements: bytes, *shared: bytes) -> tuple[list[t
         for _ in range(taken):
             slots.acquire()
     try:
-        # The scheduler knows of the begin before the jobs begin, which may kill this worker.
-        told = {"topic": batch.topic, "msg": json.dumps([key, 0, None])}
-        distributed.utils.sync(worker.loop, worker.scheduler.log_event, **told)
-        watch = _Events(worker, batch.topic, key) if len(batch.jobs) == 1 else JobWatch[Any]()
-        contents, began = dict(zip(batch.names, shared, strict=True)), time.monotonic()
+        contents, began = dict(zip(names, shared, strict=True)), time.monotonic()
         ends = [
             (number, replace(end, failure=end.failure and replace(end.failure, worker=worker.address)))
-            for number, end in pool.ends(batch.jobs, contents, batch.encode, watch, plugins, wanted)
+            for number, end in pool.ends(jobs, contents, encode, JobWatch(), plugins, wanted)
         ]
         return ends, time.monotonic() - began
     finally:
@@ -174,16 +166,3 @@ def _processes(thread: int, preload: tuple[str, ...]) -> Processes:  # noqa: ARG
 @cache
 def _slots(count: int) -> threading.Semaphore:
     return threading.Semaphore(count)
-
-
-@dataclass(frozen=True)
-class _Events(JobWatch[Any]):
-    """Tells the client of progress by events in JSON: nobody unpickles what others may publish."""
-
-    worker: Any
-    topic: str
-    key: str
-
-    def moved(self, number: int, event: Progress) -> None:
-        # A plug-in may report NumPy's integers.
-        self.worker.log_event(self.topic, json.dumps([self.key, number, asdict(event)], default=str))
