@@ -13,7 +13,8 @@ import logging
 import pickle
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
@@ -33,7 +34,7 @@ from distributed.core import send_recv
 
 from omnibench.errors import ConfigError, OmnibenchError, one_line
 from omnibench.jobs import dask_worker
-from omnibench.jobs.job import BackendError, Failure, Job, JobEnd, JobWatch, TlsFiles
+from omnibench.jobs.job import BackendError, Encode, Ends, Failure, Job, JobEnd, JobWatch, Numbered, TlsFiles
 from omnibench.jobs.job_process import Packer
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter, no_progress
@@ -188,63 +189,67 @@ class DaskBackend:
         )
         answers = client.run(dask_worker.prepare, self._requirements, on_error="return")
         for worker, answer in answers.items():
-            if isinstance(answer, dask_worker.UnfitWorkerError):
+            if isinstance(answer, OmnibenchError):
                 raise answer
             if isinstance(answer, BaseException):  # another Python, or no omnibench
-                reason = one_line(f"{type(answer).__name__}: {answer}")
-                raise dask_worker.UnfitWorkerError(
-                    f"worker {worker} cannot run omnibench's jobs ({reason}); install the same there"
-                )
+                reason = one_line(f"worker {worker} cannot run omnibench's jobs ({type(answer).__name__}: {answer})")
+                raise dask_worker.UnfitWorkerError(f"{reason}; install the same there")
         page = client.dashboard_link
         if find_spec("bokeh") is None:  # which the dashboard needs; these pages do not
             page = page.replace("/status", "/info/main/workers.html")
         report(Progress("dask", result=f"{plural(len(answers), 'worker')} of Dask, dashboard {page}"))
 
-    def run(
-        self, jobs: Iterable[tuple[int, Job[T]]], encode: Callable[[T], Any], watch: JobWatch[T]
-    ) -> Generator[tuple[int, Job[T], JobEnd], None, None]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run the jobs, see Backend. ClusterLostError, or UnfitWorkerError of a worker that joined later."""
-        waiting = iter(jobs)
+        waiting, batch = iter(jobs), dict[int, Job[T]]()
         alone: list[dict[int, Job[T]]] = []  # jobs of batches whose worker was killed
-        active: dict[Any, dict[int, Job[T]]] = {}  # jobs by their task's future
+        active: dict[Any, tuple[dict[int, Job[T]], str]] = {}  # jobs and their worker, by their task's future
         done: SimpleQueue[Any] = SimpleQueue()  # futures
-        slots, looked, seconds = self._slots(), time.monotonic(), _BATCH
+        free: list[str] = []  # a worker for each of its free threads
+        looked, seconds = 0.0, _BATCH
         try:
             while True:
+                if time.monotonic() - looked >= _LOOK:
+                    free, looked = self._free(worker for _, worker in active.values()), time.monotonic()
                 size = min(max(int(_BATCH / max(seconds, 1e-6)), 1), _LARGEST_BATCH)
-                while len(active) < slots and (batch := alone.pop() if alone else dict(islice(waiting, size))):
-                    future = self._submit(batch, encode)
-                    active[future] = batch
+                batch = batch or (alone.pop() if alone else dict(islice(waiting, size)))
+                if batch and free:
+                    future = self._submit(batch, encode, free[-1])
+                    active[future] = batch, free.pop()
                     future.add_done_callback(done.put)
                     for number in batch:
                         watch.began(number)
-                if not active:
+                    batch = {}
+                    continue
+                if not batch and not active:
                     return
-                with suppress(Empty):
+                try:
                     future = done.get(timeout=_LOOK)
-                    batch, error = active.pop(future), future.status == "error" and future.exception()
-                    if isinstance(error, KilledWorker):
-                        looked = 0.0
-                        if len(batch) > 1:
-                            alone += [{number: job} for number, job in batch.items()]
-                            continue
-                        # A scheduler that was not started here has tried again by itself.
-                        tries = error.allowed_failures and f" in each of {error.allowed_failures + 1} tries"
-                        reason = f"its worker {error.last_worker.address} was killed{tries or ''}"
-                        for number, job in batch.items():
-                            yield number, job, JobEnd(failure=Failure(reason, killed=not tries))
-                    elif isinstance(error, OmnibenchError):
-                        raise error  # a worker joined later and is unfit
-                    elif error:
-                        reason = one_line(f"{type(error).__name__}: {error}")
-                        raise BackendError(f"a Dask worker failed ({reason}); start it again")
+                except Empty:
+                    continue
+                ended, worker = active.pop(future)
+                error = future.exception() if future.status == "error" else None
+                if isinstance(error, KilledWorker):
+                    looked = 0.0
+                    # A scheduler that was not started here has tried again by itself.
+                    tries = f" in each of {error.allowed_failures + 1} tries" if error.allowed_failures else ""
+                    failure = Failure(f"its worker {error.last_worker.address} was killed{tries}", killed=not tries)
+                    if len(ended) > 1:
+                        alone += [{number: job} for number, job in ended.items()]
                     else:
-                        ends, spent = future.result()
-                        seconds += _WEIGHT * (spent / len(batch) - seconds)
-                        for number, end in ends:
-                            yield number, batch[number], end
-                if time.monotonic() - looked >= _LOOK:
-                    slots, looked = self._slots(), time.monotonic()
+                        for number, job in ended.items():
+                            yield number, job, JobEnd(failure=failure)
+                elif isinstance(error, OmnibenchError):
+                    raise error  # a worker joined later and is unfit
+                elif error is not None:
+                    reason = one_line(f"{type(error).__name__}: {error}")
+                    raise BackendError(f"a Dask worker failed ({reason}); start it again")
+                else:
+                    ends, spent = future.result()
+                    free.append(worker)
+                    seconds += _WEIGHT * (spent / len(ended) - seconds)
+                    for number, end in ends:
+                        yield number, ended[number], end
         except (CommClosedError, FutureCancelledError, TimeoutError):  # TimeoutError: it is frozen, or its machine gone
             address = self.client.scheduler.address
             raise ClusterLostError(
@@ -255,28 +260,26 @@ class DaskBackend:
                 with suppress(OSError):  # a scheduler that does not answer in time
                     self.client.cancel([*active], force=True)
 
-    def _submit(self, batch: dict[int, Job[T]], encode: Callable[[T], Any]) -> Any:
-        """The future of a batch's task."""
+    def _submit(self, batch: dict[int, Job[T]], encode: Encode, worker: str) -> Any:
+        """The future of a batch's task, for another worker if this one is gone."""
         packed = tuple((number, self._packer.pack(job)) for number, job in batch.items())
         names = tuple({name: None for _, job in packed for name in job.names})
         timed = any(job.timed for job in batch.values())
-        data = [self._content("requirements", self._requirements)]
-        data += [self._content(name, self._packer.shared[name]) for name in names]
-        return self.client.submit(dask_worker.carry_out, packed, names, encode, timed, *data, pure=False)
+        needed = {"requirements": self._requirements} | {name: self._packer.shared[name] for name in names}
+        for name, content in needed.items():  # which goes to the scheduler once, and from there to workers that need it
+            if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold it
+                key = f"omnibench-data-{name}-{uuid4().hex[:8]}"
+                self._data[name] = self.client.submit(dask_worker.content, content, key=key)
+        data = [self._data[name] for name in needed]
+        options = {"workers": [worker], "allow_other_workers": True, "pure": False}
+        return self.client.submit(dask_worker.carry_out, packed, names, encode, timed, *data, **options)
 
-    def _content(self, name: str, value: bytes) -> Any:
-        """The future of data, which go to the scheduler once, and from there to each worker that needs them."""
-        if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold them
-            key = f"omnibench-data-{name}-{uuid4().hex[:8]}"
-            self._data[name] = self.client.submit(dask_worker.content, value, key=key)
-        return self._data[name]
-
-    def _slots(self) -> int:
-        """Threads of all workers, 1 without any. ClusterLostError: there has been no worker for long."""
+    def _free(self, busy: Iterable[str]) -> list[str]:
+        """A worker for each of its threads that is not ``busy``. ClusterLostError: no worker for long."""
         if self.client.status != "running":
             raise CommClosedError
-        slots = sum(self.client.sync(self.client.scheduler.ncores, callback_timeout=WAIT).values())
-        if slots:
+        threads = Counter[str](self.client.sync(self.client.scheduler.ncores, callback_timeout=WAIT))
+        if threads:
             if self._without is not None:
                 self._report(Progress("waiting for a worker", result=""))
             self._without = None
@@ -289,4 +292,4 @@ class DaskBackend:
                 f"no worker has been left at the Dask scheduler {address} for {WAIT:g} s; start some "
                 f"(dask worker {address}), then the same command"
             )
-        return max(slots, 1)
+        return [*(threads - Counter(busy)).elements()]

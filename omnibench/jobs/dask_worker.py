@@ -13,7 +13,7 @@ import pickle
 import platform
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points, version
@@ -24,7 +24,7 @@ import distributed
 
 from omnibench.errors import DataError
 from omnibench.files import write_text
-from omnibench.jobs.job import BackendError, Job, JobEnd, JobWatch, code_digest
+from omnibench.jobs.job import BackendError, Encode, Job, JobEnd, code_digest
 from omnibench.jobs.job_process import PackedJob, Packer, Processes
 from omnibench.progress import Reporter
 from omnibench.registry import REGISTRIES, PluginFailure, import_copies
@@ -101,7 +101,8 @@ def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Pat
         raise UnfitWorkerError(f"worker {address}: {error}") from None
     if plugins:  # imported in a process, which they may crash
         job = Packer().pack(Job("plug-ins", _import_all, plugins))
-        ((_, end),) = Processes(1, client.preload).ends([(0, job)], {}, list, JobWatch())
+        ((_, end),) = Processes(1, client.preload).events([(0, job)], {}, list)
+        assert isinstance(end, JobEnd)  # it does not report
         if end.failure is not None:
             raise UnfitWorkerError(f"worker {address}: its plug-ins cannot be imported there: {end.failure.reason}")
         for failure in end.encoded:
@@ -123,21 +124,16 @@ def content(data: bytes) -> bytes:
 
 
 def carry_out(
-    jobs: Sequence[tuple[int, PackedJob]],
-    names: Sequence[str],
-    encode: Callable[[Any], Any],
-    timed: bool,
-    requirements: bytes,
-    *shared: bytes,
+    jobs: Sequence[tuple[int, PackedJob]], names: Sequence[str], encode: Encode, timed: bool, *data: bytes
 ) -> tuple[list[tuple[int, JobEnd]], float]:
     """Task of some jobs, one after the other: their ends, and the seconds that they took.
 
-    names, shared: of what they share, and its contents. timed: they have the worker to themselves. UnfitWorkerError:
-    this worker joined after the first job, and is not as it must be.
+    timed: they have the worker to themselves. data: requirements, and contents of what the jobs share, whose names are
+    ``names``. UnfitWorkerError: this worker joined after the first job, and is not as it must be.
     """
     worker: Any = distributed.get_worker()
-    key, plugins = worker.get_current_task(), prepare(requirements, worker)
-    pool = _processes(threading.get_ident(), pickle.loads(requirements).preload)
+    key, plugins = worker.get_current_task(), prepare(data[0], worker)
+    pool = _processes(threading.get_ident(), pickle.loads(data[0]).preload)
     slots, taken = _slots(worker.state.nthreads), worker.state.nthreads if timed else 1
 
     def wanted() -> bool:
@@ -148,10 +144,12 @@ def carry_out(
         for _ in range(taken):
             slots.acquire()
     try:
-        contents, began = dict(zip(names, shared, strict=True)), time.monotonic()
+        began = time.monotonic()
+        events = pool.events(jobs, dict(zip(names, data[1:], strict=True)), encode, plugins, wanted)
         ends = [
             (number, replace(end, failure=end.failure and replace(end.failure, worker=worker.address)))
-            for number, end in pool.ends(jobs, contents, encode, JobWatch(), plugins, wanted)
+            for number, end in events
+            if isinstance(end, JobEnd)
         ]
         return ends, time.monotonic() - began
     finally:

@@ -24,6 +24,7 @@ from omnibench.files import remove, write_text
 from omnibench.progress import Progress, Reporter, expect_reading, no_progress, tell_reading
 
 T = TypeVar("T")
+Encode = Callable[[Any], Any]  # see Store
 
 TRIES = 3  # how often a job whose process or worker is killed is begun: two chances that memory is free again; chosen
 
@@ -199,12 +200,14 @@ class JobWatch(Generic[T]):
         """The job has ended, or its result was there already (``reused``)."""
 
 
+Numbered = tuple[int, Job[T]]
+Ends = Generator[tuple[int, Job[T], JobEnd], None, None]
+
+
 class Backend(Protocol):
     """Place where jobs are run: this process, processes of this machine, or other machines."""
 
-    def run(
-        self, jobs: Iterable[tuple[int, Job[T]]], encode: Callable[[T], Any], watch: JobWatch[T]
-    ) -> Generator[tuple[int, Job[T], JobEnd], None, None]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run numbered jobs, which are taken as workers become free, and yield them as they end.
 
         encode: see Store; called by the worker. When the iterator is closed or interrupted, workers are ended at once.

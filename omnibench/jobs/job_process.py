@@ -11,17 +11,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from io import BytesIO
+from io import BytesIO, TextIOWrapper
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from omnibench import processes
-from omnibench.jobs.job import Backend, Failure, Job, JobEnd, JobWatch, failure_of
+from omnibench.jobs.job import Backend, Encode, Ends, Failure, Job, JobEnd, JobWatch, Numbered, failure_of
 from omnibench.progress import Progress
 from omnibench.registry import import_copies
 
@@ -38,23 +38,15 @@ _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people an
 _in_job = False  # True in a process of jobs
 
 
-@contextmanager
-def limited_memory(megabytes: float | None) -> Iterator[None]:
-    """Limit the process's private memory, beyond which allocations raise MemoryError; None: no limit.
+def limit_memory(megabytes: float | None) -> None:
+    """Limit the process's private memory, beyond which allocations raise MemoryError; None: as far as is allowed.
 
     RLIMIT_DATA counts memory that can be written to (anonymous mappings, since Linux 4.7). RLIMIT_AS also counts
     address space that is only reserved: with 700 MB of it before a run begins, Numba and polars then cannot be loaded.
     """
-    if megabytes is None:
-        yield
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = int(megabytes * _MEGABYTE)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))  # there is room for reporting the error
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = most if megabytes is None else int(megabytes * _MEGABYTE)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 
 
 def memory_limit() -> float | None:
@@ -132,7 +124,7 @@ class _JobProcess:
         return time.monotonic() - self._began <= _LIFE and self._process.is_alive()
 
     def give(self, job: PackedJob, *given: Any, shared: Mapping[str, bytes]) -> None:
-        """Begin a job. given: ``encode`` and ``plugins`` of ``Processes.ends``."""
+        """Begin a job. given: ``encode`` and ``plugins`` of ``Processes.events``."""
         self.job, self._kills = job, _oom_kills()
         self._deadline = None if job.seconds is None else time.monotonic() + job.seconds
         missing = {name: shared[name] for name in job.names if name not in self._sent}
@@ -178,15 +170,13 @@ def _serve(connection: Connection) -> None:
     _in_job = True
     signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
+    cast(TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)  # what it prints does not end with it
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
     threading.Thread(target=processes.end_with_parent, daemon=True).start()
     shared: dict[str, Any] = {}
     with processes.one_thread():
         while connection.poll(2 * _LIFE):
             end = _do(connection, shared)
-            for stream in (sys.stdout, sys.stderr):
-                with suppress(OSError, ValueError):  # closed by a plug-in
-                    stream.flush()
             try:
                 connection.send(end)
             except OSError:  # a plug-in has closed it
@@ -219,9 +209,11 @@ def _do(connection: Connection, shared: dict[str, Any]) -> JobEnd:
         unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
         function, argument = unpickler.load()
         try:
-            with limited_memory(memory_mb):
-                result = function(argument, report)
+            if memory_mb is not None:
+                limit_memory(memory_mb)
+            result = function(argument, report)
         finally:
+            limit_memory(None)  # there is room for reporting an error
             if os.getpid() != process:  # a plug-in forked: its copy of this process has no answer to give
                 os._exit(0)
         return JobEnd(encode(result), last=last)
@@ -237,9 +229,7 @@ def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
 class InPlace:
     """Runs jobs one after the other in this process. Their limits are not enforced."""
 
-    def run(
-        self, jobs: Iterable[tuple[int, Job[T]]], encode: Callable[[T], Any], watch: JobWatch[T]
-    ) -> Generator[tuple[int, Job[T], JobEnd], None, None]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run the jobs, see Backend."""
         for number, job in jobs:
             watch.began(number)
@@ -266,34 +256,35 @@ class Processes:
     lasting: bool = False
     _idle: list[_JobProcess] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    def run(
-        self, jobs: Iterable[tuple[int, Job[T]]], encode: Callable[[T], Any], watch: JobWatch[T]
-    ) -> Generator[tuple[int, Job[T], JobEnd], None, None]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run the jobs, see Backend."""
         if _in_job:
             yield from InPlace().run(jobs, encode, watch)
             return
         packer, taken = Packer(), dict[int, Job[T]]()
 
-        def packed() -> Iterator[tuple[int, PackedJob]]:
+        def packed() -> Iterator[tuple[int, PackedJob]]:  # which is asked for a job when a process is free
             for number, job in jobs:
                 taken[number] = job
+                watch.began(number)
                 yield number, packer.pack(job)
 
-        with closing(self.ends(packed(), packer.shared, encode, watch)) as ends:
-            for number, end in ends:
-                yield number, taken.pop(number), end
+        with closing(self.events(packed(), packer.shared, encode)) as events:
+            for number, event in events:
+                if isinstance(event, JobEnd):
+                    yield number, taken.pop(number), event
+                else:
+                    watch.moved(number, event)
 
-    def ends(
+    def events(
         self,
         jobs: Iterable[tuple[int, PackedJob]],
         shared: Mapping[str, bytes],
-        encode: Callable[[Any], Any],
-        watch: JobWatch[Any],
+        encode: Encode,
         plugins: Mapping[Path, Path] | None = None,
         wanted: Callable[[], bool] = lambda: True,
-    ) -> Generator[tuple[int, JobEnd], None, None]:
-        """Run packed jobs and yield their ends; all stop once ``wanted`` is false.
+    ) -> Generator[tuple[int, Progress | JobEnd], None, None]:
+        """Run packed jobs and yield their reports and ends; all stop once ``wanted`` is false.
 
         shared: contents of what they share. plugins: copies of plug-in files here, by their paths at home.
         """
@@ -308,21 +299,19 @@ class Processes:
                             self._idle.pop().end()
                         process = self._idle.pop() if self._idle and not job.limited else _JobProcess(context)
                         active[process] = number
-                        watch.began(number)
                         process.give(job, encode, plugins or {}, shared=shared)
                     if not active or not wanted():
                         return
                     wait([sign for process in active for sign in process.signs], timeout=_PERIOD)
                     for process, number in [*active.items()]:
                         event = process.receive()
-                        if isinstance(event, Progress):
-                            watch.moved(number, event)
-                        elif event is not None:
+                        if isinstance(event, JobEnd):
                             del active[process]
                             if event.failure is None and not process.job.limited:
                                 self._idle.append(process)
                             else:
                                 process.end()
+                        if event is not None:
                             yield number, event
             finally:
                 for process in active:

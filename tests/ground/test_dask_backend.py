@@ -39,7 +39,7 @@ def dask() -> Iterator[DaskBackend]:
 
 
 class TestDask(EveryBackend):
-    ahead = 2  # one for each worker
+    ahead = 3  # one for each worker, and the next
 
     @pytest.fixture
     def backend(self, dask: DaskBackend) -> DaskBackend:
