@@ -60,8 +60,7 @@ _SETTINGS = {
 }
 _STARTS = 3  # tries to start a cluster here, as a worker may be killed while it starts; chosen
 _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
-_BATCH, _LARGEST_BATCH = 0.2, 50  # s of work, and jobs, that travel together: a task costs 5 ms in all; chosen
-_WEIGHT = 0.1  # weight of the latest job's time in the running mean; chosen
+_BATCH, _LARGEST_BATCH = 0.5, 100  # s of work, and jobs, that travel together: a task costs 5 ms in all; chosen
 
 
 class ClusterLostError(BackendError):
@@ -102,19 +101,18 @@ def _local_client(workers: int) -> Iterator[Any]:
     # The cluster has certificates of its own: other users of this machine cannot join.
     options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": None, "security": True}
     with main_module_hidden():  # a worker that died is started again at any time
-        cluster, tried = None, 0
-        while cluster is None:
-            tried += 1
+        for tried in range(1, _STARTS + 1):
             try:
                 with interrupts_blocked():
                     cluster = distributed.LocalCluster(
                         **options, dashboard_address="127.0.0.1:8787", silence_logs=logging.CRITICAL
                     )
+                break
             except (RuntimeError, OSError) as error:
                 if tried == _STARTS:
                     raise ClusterLostError(
-                        f"no workers of Dask start here ({one_line(str(error))}), in {_STARTS} tries; free memory or "
-                        "take fewer workers, then the same command"
+                        f"no workers of Dask start here ({one_line(str(error))}), in {_STARTS} tries; results so "
+                        "far are kept: free memory or take fewer workers, then the same command"
                     ) from None
         with (
             _closing(cluster, _CLUSTER_CLOSED),
@@ -206,12 +204,11 @@ class DaskBackend:
         active: dict[Any, tuple[dict[int, Job[T]], str]] = {}  # jobs and their worker, by their task's future
         done: SimpleQueue[Any] = SimpleQueue()  # futures
         free: list[str] = []  # a worker for each of its free threads
-        looked, seconds = 0.0, _BATCH
+        looked, size = 0.0, 1
         try:
             while True:
                 if time.monotonic() - looked >= _LOOK:
                     free, looked = self._free(worker for _, worker in active.values()), time.monotonic()
-                size = min(max(int(_BATCH / max(seconds, 1e-6)), 1), _LARGEST_BATCH)
                 batch = batch or (alone.pop() if alone else dict(islice(waiting, size)))
                 if batch and free:
                     future = self._submit(batch, encode, free[-1])
@@ -237,8 +234,8 @@ class DaskBackend:
                     if len(ended) > 1:
                         alone += [{number: job} for number, job in ended.items()]
                     else:
-                        for number, job in ended.items():
-                            yield number, job, JobEnd(failure=failure)
+                        ((number, job),) = ended.items()
+                        yield number, job, JobEnd(failure=failure)
                 elif isinstance(error, OmnibenchError):
                     raise error  # a worker joined later and is unfit
                 elif error is not None:
@@ -247,7 +244,7 @@ class DaskBackend:
                 else:
                     ends, spent = future.result()
                     free.append(worker)
-                    seconds += _WEIGHT * (spent / len(ended) - seconds)
+                    size = max(min(2 * size, _LARGEST_BATCH, int(_BATCH * len(ended) / spent)), 1)
                     for number, end in ends:
                         yield number, ended[number], end
         except (CommClosedError, FutureCancelledError, TimeoutError):  # TimeoutError: it is frozen, or its machine gone

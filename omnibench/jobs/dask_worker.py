@@ -51,15 +51,6 @@ def software() -> dict[str, str]:
     }
 
 
-def differences(there: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
-    """What another machine has in the place of what is here, in words."""
-    return [
-        f"{name} {there.get(name, 'missing')} (here: {here.get(name, 'missing')})"
-        for name in dict.fromkeys((*here, *there))
-        if here.get(name) != there.get(name)
-    ]
-
-
 class UnfitWorkerError(BackendError):
     """A worker on which results could differ from the client's, or that cannot run jobs."""
 
@@ -68,7 +59,7 @@ class UnfitWorkerError(BackendError):
 class Requirements:
     """What a worker must have. software: the client's. plugins: text of its plug-in files by path, and which fail."""
 
-    software: Mapping[str, str]
+    software: dict[str, str]
     plugins: Mapping[Path, str]
     failing: frozenset[str]
     preload: tuple[str, ...]
@@ -85,7 +76,9 @@ def _prepared(requirements: bytes, address: str, folder: Path) -> dict[Path, Pat
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # a nanny's: with it arrays take half as long again as at home
     multiprocessing.current_process().daemon = False  # a nanny's workers may not start processes otherwise
     client: Requirements = pickle.loads(requirements)
-    if wrong := differences(software(), client.software):
+    there, here = software(), client.software
+    names = [name for name in here | there if here.get(name) != there.get(name)]
+    if wrong := [f"{name} {there.get(name, 'missing')} (here: {here.get(name, 'missing')})" for name in names]:
         raise UnfitWorkerError(
             f"worker {address} has {', '.join(wrong)}: results could differ; install the same on the worker, or work "
             "with workers that have it"
