@@ -52,15 +52,11 @@ def check_backend(name: str, tls: TlsFiles | None = None) -> None:
     if tls is not None:
         if not with_tls:
             raise ConfigError(f"backend {name}: files of TLS are for a scheduler at tls://HOST:PORT; leave them out")
-        for what, file in (("ca", tls.ca), ("cert", tls.cert), ("key", tls.key)):
-            if not file.is_file():
-                flaw = "is a folder" if file.is_dir() else "no such file"
-                raise ConfigError(f"backend {name}: {what}: {file}: {flaw}")
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        what = f"ca: {tls.ca}: holds no certificate in PEM"
+        what = f"ca: {tls.ca}: is no file of certificates in PEM"
         try:
             context.load_verify_locations(tls.ca)
-            what = f"cert and key: {tls.cert}, {tls.key}: are no certificate in PEM with its key"
+            what = f"cert and key: {tls.cert}, {tls.key}: are no files of a certificate in PEM and its key"
             context.load_cert_chain(tls.cert, tls.key)
         except OSError as error:  # ssl.SSLError is one
             raise ConfigError(f"backend {name}: {what} ({error})") from None
@@ -84,14 +80,13 @@ def open_backend(
         finally:
             processes.close()
         return
-    from omnibench.jobs.dask_backend import DaskBackend, checked_requirements, dask_client, say_cluster
+    from omnibench.jobs.dask_backend import DaskBackend, dask_client
 
     address = None if choice.name == "dask" else choice.name
-    with dask_client(address, choice.workers, choice.tls, report) as client:
-        backend = DaskBackend(client, checked_requirements(client, preload), report)
+    with dask_client(address, choice.workers, choice.tls) as client:
+        backend = DaskBackend(client, preload, report)
         if choice.name.startswith("tcp:"):
             risk = f"whoever reaches {choice.name} runs code on its workers and here"
             way_out = "with tls://HOST:PORT it asks for certificates (omnibench guide scale)"
             report(Progress("tcp", result=f"warning: {risk}; {way_out}"))
-        say_cluster(client, report)
         yield backend

@@ -1,8 +1,7 @@
-"""The protocol of many independent jobs: a picklable specification in, a result file out.
+"""Many independent jobs: a picklable specification in, a result in a store out.
 
-A job's result is what stands in the store, and nothing else: the file that its worker wrote, or that the client wrote
-for a worker on another machine. So a job whose file is there is not run again, whatever became of the parent, and a
-worker that dies after writing has done its work. A backend only runs jobs and says which ended how.
+A backend runs jobs and gives the encoded results back to the process that asked, which alone writes the store. So a job
+whose result is stored is not run again, whatever ended the work, and workers need no folder in common.
 """
 
 from __future__ import annotations
@@ -10,23 +9,24 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import BaseModel, TypeAdapter
 
 from omnibench.config import Model, RelativePath
-from omnibench.errors import DataError, OmnibenchError
+from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.files import remove, write_text
 from omnibench.progress import Progress, Reporter, expect_reading, no_progress, tell_reading
 
 T = TypeVar("T")
+Encode = Callable[[Any], Any]  # see Store
 
-TRIES = 3  # how often a job whose worker is killed is begun: two chances that memory is free again; chosen
+TRIES = 3  # how often a job whose process or worker is killed is begun: two chances that memory is free again; chosen
 
 
 class TlsFiles(Model):
@@ -62,30 +62,16 @@ def code_digest(package: Path, files: Iterable[Path]) -> str:
 
 
 class Store(Protocol[T]):
-    """Where results of jobs are kept, by key."""
-
-    def anchored(self) -> Self:
-        """The store, to be found by a job that changes its working folder, too."""
-        return self
+    """Results of jobs, by key."""
 
     def get(self, key: str) -> T | None:
         """The stored result; None where there is none."""
 
-    def keep(self, key: str, result: T) -> Any:
-        """Keep a result where it was made; what this returns, if anything, is then given to ``put_content`` at home."""
+    def encode(self, result: T) -> Any:
+        """What ``put_encoded`` takes; called where the result was made. ValueError for a wrong type."""
 
-    def content(self, key: str, result: T) -> Any:
-        """The result as ``put_content`` takes it from a machine that does not reach the store."""
-
-    def put(self, key: str, result: T) -> None:
-        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
-        self.put_content(key, self.content(key, result))
-
-    def put_content(self, key: str, content: Any) -> None:
-        """Store a result that another process made the content of."""
-
-    def file(self, key: str) -> Path:
-        """Where the result stands, in words of a message."""
+    def put_encoded(self, key: str, encoded: Any) -> None:
+        """Store a result that ``encode`` has encoded. DataError when it cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +84,6 @@ class ResultStore(Store[T]):
     folder: Path
     kind: type[T]
 
-    def anchored(self) -> Self:
-        """The store by its folder's absolute path."""
-        return replace(self, folder=self.folder.absolute())
-
     def get(self, key: str) -> T | None:
         """The stored result; None where there is none, or its file is damaged."""
         try:
@@ -109,17 +91,17 @@ class ResultStore(Store[T]):
         except (OSError, ValueError):  # ValueError: pydantic's and Unicode's errors, too
             return None
 
-    def keep(self, key: str, result: T) -> None:
-        """Store a result, as ``put``: a job whose file is there has done its work, whatever becomes of its parent."""
-        self.put(key, result)
+    def put(self, key: str, result: T) -> None:
+        """Store a result, whole or not at all. DataError when it cannot be written, ValueError for a wrong type."""
+        self.put_encoded(key, self.encode(result))
 
-    def content(self, key: str, result: T) -> str:  # noqa: ARG002 (as ``put``)
+    def encode(self, result: T) -> str:
         """What the result's file will hold. ValueError for a wrong type."""
         return json.dumps(_adapter(self).dump_python(result, mode="json", warnings="error"))
 
-    def put_content(self, key: str, content: str) -> None:
-        """Store a result that another process made the content of. DataError when it cannot be written."""
-        write_text(self.file(key), content)
+    def put_encoded(self, key: str, encoded: str) -> None:
+        """Write a result's file. DataError when it cannot be written."""
+        write_text(self.file(key), encoded)
 
     def file(self, key: str) -> Path:
         """The result's file."""
@@ -144,10 +126,10 @@ class Job(Generic[T]):
 
     key: names everything that the result depends on, see ``content_key``. function: from the top of a module; called
     with the argument and a function that reports progress. seconds, memory_mb: limits of its wall time and of its
-    process's memory (10^6 bytes), None for no limit. timed: its seconds are compared, so that on another machine it has
-    the worker to itself. shared: objects within the argument that other jobs hold, too; to another machine each travels
-    once. own: it runs omnibench's own code alone, which leaves nothing behind: such jobs have a process together for
-    longer, and within it what they share.
+    process's memory (10^6 bytes), None for no limit. A job with a limit has a process of its own; those without share
+    processes, so that they must leave nothing behind. timed: its seconds are compared, so that on another machine it
+    has the worker to itself. shared: objects within the argument that other jobs hold, too, and none of them changes;
+    to another process each travels once.
     """
 
     key: str
@@ -157,16 +139,6 @@ class Job(Generic[T]):
     memory_mb: float | None = None
     timed: bool = False
     shared: tuple[Any, ...] = ()
-    own: bool = False
-
-    @property
-    def limited(self) -> bool:
-        """True for a job with a limit, which needs a process of its own."""
-        return self.seconds is not None or self.memory_mb is not None
-
-    def run(self, store: Store[T], report: Reporter) -> None:
-        """Do the work here and write the result's file."""
-        store.put(self.key, self.function(self.argument, report))
 
 
 class BackendError(OmnibenchError):
@@ -177,22 +149,42 @@ class BackendError(OmnibenchError):
 class Failure:
     """Reason, in words, why a job has no result.
 
-    error: what its function raised. over_time: it was ended at its time limit. killed: its worker was killed, not by
-    a fault of its own as far as can be known.
+    pickled: the error that its function raised, see ``error``. over_time: it was ended at its time limit. killed: its
+    process was killed, not by a fault of its own as far as can be known. worker: address of the Dask worker, if any.
     """
 
     reason: str
-    error: BaseException | None = None
+    pickled: bytes | None = field(default=None, repr=False)
     over_time: bool = False
     killed: bool = False
+    worker: str = field(default="", compare=False)
+
+    @property
+    def error(self) -> BaseException | None:
+        """What the job's function raised; None if it did not, or if the error cannot be pickled."""
+        return None if self.pickled is None else pickle.loads(self.pickled)
 
 
-class Ended(NamedTuple):
-    """A job that a backend has run, by its number; failure: None where it ended by itself without an error."""
+def failure_of(error: BaseException, memory_mb: float | None) -> Failure:
+    """The failure of a job that raised an error. memory_mb: the job's limit."""
+    reason = one_line(f"{type(error).__name__}: {error}")
+    if isinstance(error, MemoryError):
+        reason = "out of memory" if memory_mb is None else f"out of memory (limit {memory_mb:g} MB)"
+    try:
+        pickled = pickle.dumps(error)
+        pickle.loads(pickled)
+    except Exception:  # whatever the error's class raises
+        return Failure(reason)
+    return Failure(reason, pickled)
 
-    number: int
-    job: Job[Any]
-    failure: Failure | None
+
+@dataclass(frozen=True)
+class JobEnd:
+    """The end of a job: its encoded result, or why it has none. last: its last progress."""
+
+    encoded: Any = None
+    failure: Failure | None = None
+    last: Progress | None = None
 
 
 class JobWatch(Generic[T]):
@@ -202,45 +194,50 @@ class JobWatch(Generic[T]):
         """A worker has begun the job, perhaps not for the first time."""
 
     def moved(self, number: int, event: Progress) -> None:
-        """The job reports progress."""
+        """The job reports progress, at most five times a second."""
 
     def ended(self, number: int, ending: T | Failure, reused: bool) -> None:
         """The job has ended, or its result was there already (``reused``)."""
 
 
+Numbered = tuple[int, Job[T]]
+Ends = Generator[tuple[int, Job[T], JobEnd], None, None]
+
+
 class Backend(Protocol):
     """Place where jobs are run: this process, processes of this machine, or other machines."""
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
-        """Run jobs, which are taken as workers become free, and yield them as they end.
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
+        """Run numbered jobs, which are taken as workers become free, and yield them as they end.
 
-        When the iterator is closed or interrupted, workers are ended at once.
+        encode: see Store; called by the worker. When the iterator is closed or interrupted, workers are ended at once.
         """
 
 
 def run_jobs(jobs: Iterable[Job[T]], store: Store[T], backend: Backend, watch: JobWatch[T]) -> None:
     """Run the jobs whose results are not in the store; ``watch`` hears of every end, results come from the store.
 
-    A job whose worker was killed is tried again after all others, at most three times in all: what killed it (the
+    A job whose process was killed is tried again after all others, at most three times in all: what killed it (the
     system, which lacked memory; a person) may be gone by then. A job that raised, was over its time or memory limit, or
     crashed would do so again. Whatever ``watch`` raises ends the work.
     """
-    store = store.anchored()
     waiting = _not_stored(jobs, store, watch)
     for tried in range(1, TRIES + 1):
         killed: list[tuple[int, Job[T]]] = []
-        for number, job, failure in backend.run(waiting, store, watch):
-            result = store.get(job.key)
-            if result is not None:
-                watch.ended(number, result, reused=False)
-            elif failure is None:
-                watch.ended(number, Failure(f"its result cannot be read: {store.file(job.key)}"), reused=False)
-            elif failure.killed and tried < TRIES:
-                killed.append((number, job))
-            else:
-                if tried > 1:
-                    failure = replace(failure, reason=f"{failure.reason} in each of {tried} tries")
-                watch.ended(number, failure, reused=False)
+        with closing(backend.run(waiting, store.encode, watch)) as ends:
+            for number, job, end in ends:
+                failure = end.failure
+                if end.last is not None:
+                    watch.moved(number, end.last)
+                if failure is None:
+                    store.put_encoded(job.key, end.encoded)
+                    result = store.get(job.key)
+                    watch.ended(number, Failure("its result cannot be read") if result is None else result, False)
+                elif failure.killed and tried < TRIES:
+                    killed.append((number, job))
+                else:
+                    tries = f" in each of {tried} tries" if failure.killed else ""
+                    watch.ended(number, replace(failure, reason=failure.reason + tries), False)
         if not killed:
             return
         waiting = iter(killed)
@@ -253,7 +250,7 @@ def _not_stored(jobs: Iterable[Job[T]], store: Store[T], watch: JobWatch[T]) -> 
         if result is None:
             yield number, job
         else:
-            watch.ended(number, result, reused=True)
+            watch.ended(number, result, True)
 
 
 def gathered(
@@ -268,50 +265,34 @@ def gathered(
     """
     if backend is None:
         return [function(argument, no_progress) for argument in arguments]
-    results: _Results[T] = _Results()
+    results = _Results[T]()
     expect_reading(len(arguments), "part")
-    jobs = (Job(str(number), function, argument, shared=shared, own=True) for number, argument in enumerate(arguments))
-    run_jobs(jobs, _InMemory[T](), backend, results)
-    return [results.by_number[number] for number in range(len(arguments))]
+    jobs = (Job(str(number), function, argument, shared=shared) for number, argument in enumerate(arguments))
+    run_jobs(jobs, results, backend, results)
+    return [results.by_key[str(number)] for number in range(len(arguments))]
 
 
-class _InMemory(Store[T]):
-    """Results in memory, pickled until they are asked for, which is once."""
+class _Results(Store[T], JobWatch[T]):
+    """Results in memory. The first failure ends the work."""
 
     def __init__(self) -> None:
-        self._contents: dict[str, bytes] = {}
-
-    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
-        return type(self), ()  # where results are made nobody needs the others
+        self.by_key: dict[str, T] = {}
 
     def get(self, key: str) -> T | None:
-        content = self._contents.pop(key, None)
-        return pickle.loads(content) if isinstance(content, bytes) else None  # no text, which events may bring
+        return self.by_key.get(key)
 
-    def keep(self, key: str, result: T) -> bytes:
-        return self.content(key, result)
-
-    def content(self, _: str, result: T) -> bytes:
+    @staticmethod
+    def encode(result: T) -> bytes:
         return pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
 
-    def put_content(self, key: str, content: bytes) -> None:
-        self._contents[key] = content
-
-    def file(self, key: str) -> Path:
-        return Path(key)
-
-
-class _Results(JobWatch[T]):
-    """The results, by number. The first failure ends the work."""
-
-    def __init__(self) -> None:
-        self.by_number: dict[int, T] = {}
+    def put_encoded(self, key: str, encoded: bytes) -> None:
+        self.by_key[key] = pickle.loads(encoded)
 
     def ended(self, number: int, ending: T | Failure, reused: bool) -> None:  # noqa: ARG002
         if not isinstance(ending, Failure):
-            self.by_number[number] = ending
             tell_reading(1, "part")
-        elif ending.error is not None:
-            raise ending.error
-        else:
-            raise DataError(f"one of many jobs has no result: {ending.reason}; run again")
+            return
+        error = ending.error or DataError(f"one of many jobs has no result: {ending.reason}; run again")
+        if ending.worker and isinstance(error, DataError):
+            raise DataError(f"worker {ending.worker}: {error} (workers must see the files of a large data set)")
+        raise error

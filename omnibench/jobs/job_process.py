@@ -10,61 +10,43 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
 from functools import partial
-from io import BytesIO
-from itertools import islice
+from io import BytesIO, TextIOWrapper
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from signal import SIG_DFL, SIG_IGN, SIGABRT, SIGHUP, SIGINT, SIGKILL, SIGSEGV, SIGTERM, Signals
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from omnibench import processes
-from omnibench.errors import one_line
-from omnibench.jobs.job import Backend, Ended, Failure, Job, JobWatch, Store
-from omnibench.progress import Progress, Reporter
+from omnibench.jobs.job import Backend, Encode, Ends, Failure, Job, JobEnd, JobWatch, Numbered, failure_of
+from omnibench.progress import Progress
 from omnibench.registry import import_copies
 
 T = TypeVar("T")
 
 _MEGABYTE = 1_000_000  # bytes
-# s after its start in which a process takes further jobs: to start one costs 20 ms (tests/studies/job_overhead.py),
-# 2 % of that; what jobs leave behind in it (memory, caches) is that of a second. What unpacking jobs takes and changes
-# does not count: the first imports their modules, as it would in every new process, too. The working folder does: by
-# it later jobs find their files.
-_YOUNG = 1.0
-_OWN = 60.0  # s, for jobs of our own code, which leave nothing behind but what they share: data need not go again
+_LIFE = 60.0  # s in which a process takes further jobs without limits, so that memory and caches end with it; chosen
 # What every process of jobs needs; pydantic imports these when a result is first written, which takes 60 ms.
 PRELOAD = (__name__, "pydantic.fields", "pydantic.dataclasses")
-_AT_ONCE = 100  # events of a process that are heard before those of others; chosen
+_PERIOD = 0.2  # s between two reports of a job's task, and two looks at limits of time; chosen
 _CLOSED = 1.0  # s in which a process dies whose end of the connection is closed; chosen
 _FROM_OUTSIDE = (SIGKILL, SIGTERM, SIGHUP, SIGINT)  # signals by which people and the system end processes
 
-_KEPT: dict[str, Any] = {}  # objects that the last job of this process shared, by their names
 _in_job = False  # True in a process of jobs
-# When the last job of this process had been unpacked (s, by time.monotonic), and what its condition was then.
-_unpacked: tuple[float, tuple[Any, ...]] = (0.0, ())
 
 
-@contextmanager
-def limited_memory(megabytes: float | None) -> Iterator[None]:
-    """Limit the process's private memory, beyond which allocations raise MemoryError; None: no limit.
+def limit_memory(megabytes: float | None) -> None:
+    """Limit the process's private memory, beyond which allocations raise MemoryError; None: as far as is allowed.
 
     RLIMIT_DATA counts memory that can be written to (anonymous mappings, since Linux 4.7). RLIMIT_AS also counts
     address space that is only reserved: with 700 MB of it before a run begins, Numba and polars then cannot be loaded.
     """
-    if megabytes is None:
-        yield
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = int(megabytes * _MEGABYTE)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))  # there is room for reporting the error
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = most if megabytes is None else int(megabytes * _MEGABYTE)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 
 
 def memory_limit() -> float | None:
@@ -73,7 +55,7 @@ def memory_limit() -> float | None:
     return None if soft == resource.RLIM_INFINITY else soft / _MEGABYTE
 
 
-def oom_kills() -> int:
+def _oom_kills() -> int:
     """Number of processes that the system has killed for lack of memory; 0 where it does not say (not Linux)."""
     try:
         counts = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
@@ -84,86 +66,43 @@ def oom_kills() -> int:
 
 @dataclass(frozen=True)
 class PackedJob:
-    """A job's function and argument as bytes, without the objects that it shares with other jobs.
-
-    shared: those objects as bytes, by their names; names: all of them, also those that its process has kept already.
-    kept: the process keeps them for the next job. plugins: copies of plug-in files here, by their paths at home.
-    """
+    """A job as it travels. content: its function and argument, pickled without what it shares, whose names are here."""
 
     content: bytes
-    shared: Mapping[str, bytes]
     names: tuple[str, ...]
-    kept: bool
-    plugins: Mapping[Path, Path] = field(default_factory=dict)
+    seconds: float | None
+    memory_mb: float | None
+
+    @property
+    def limited(self) -> bool:
+        """True for a job with a limit, which needs a process of its own."""
+        return self.seconds is not None or self.memory_mb is not None
 
 
 class Packer:
-    """Pickles jobs. Objects that they share are pickled once, and named by the hash of their content."""
+    """Pickles jobs. Objects that they share are pickled once and named by a hash. shared: their contents by name."""
 
     def __init__(self) -> None:
-        self._pickled: dict[int, tuple[Any, str, bytes]] = {}  # by id: the object, its name and its content
+        self.shared: dict[str, bytes] = {}
+        self._named: dict[int, tuple[Any, str]] = {}  # by id: the object, which is kept alive, and its name
 
-    def pack(self, job: Job[Any]) -> tuple[bytes, dict[str, bytes]]:
-        """The job's function and argument without what it shares, and that by its names."""
+    def pack(self, job: Job[Any]) -> PackedJob:
+        """The job without what it shares, which is added to ``shared``."""
         for value in job.shared:
-            if id(value) not in self._pickled:
+            if id(value) not in self._named:
                 content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-                self._pickled[id(value)] = value, hashlib.sha256(content).hexdigest()[:20], content
-        shared = {id(value): self._pickled[id(value)] for value in job.shared}
-        names = {key: name for key, (_, name, _) in shared.items()}
+                self._named[id(value)] = value, hashlib.sha256(content).hexdigest()[:20]
+                self.shared[self._named[id(value)][1]] = content
+        names = {id(value): self._named[id(value)][1] for value in job.shared}
         stream = BytesIO()
         pickler = pickle.Pickler(stream, pickle.HIGHEST_PROTOCOL)
         pickler.persistent_id = lambda value: names.get(id(value))  # type: ignore[method-assign]
         pickler.dump((job.function, job.argument))
-        return stream.getvalue(), {name: content for _, name, content in shared.values()}
-
-    def portable(self, job: Job[Any]) -> Job[Any]:
-        """The job as another process unpacks it: its argument is a PackedJob."""
-        content, shared = self.pack(job)
-        return replace(job, function=run_packed, argument=PackedJob(content, shared, tuple(shared), job.own), shared=())
+        return PackedJob(stream.getvalue(), tuple(names.values()), job.seconds, job.memory_mb)
 
 
-def run_packed(packed: PackedJob, report: Reporter) -> Any:
-    """Unpack a job in its process and run it."""
-    global _unpacked
-    import_copies(packed.plugins)
-    shared = {name: pickle.loads(content) for name, content in packed.shared.items()}
-    if packed.kept:
-        shared |= {name: _KEPT[name] for name in packed.names if name not in shared}
-        _KEPT.clear()
-        _KEPT.update(shared)
-    unpickler = pickle.Unpickler(BytesIO(packed.content))
-    unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
-    function, argument = unpickler.load()
-    _unpacked = time.monotonic(), _condition()
-    return function(argument, report)
-
-
-@dataclass(frozen=True)
-class JobEnd:
-    """The end of a job, in parts that any process can read.
-
-    answer: what ``keep`` returned. error: what the job raised, pickled. lost: why it has neither, as its process died
-    or was ended. reusable: the process is as it was when the job had been unpacked, which took ``unpacking`` s, and in
-    the working folder in which it began.
-    """
-
-    answer: Any = None
-    error: bytes | None = None
-    lost: Failure | None = None
-    reusable: bool = False
-    unpacking: float = 0.0
-
-    def failure(self, job: Job[Any]) -> Failure | None:
-        """Why the job has no result; None where it has ended well."""
-        return self.lost if self.error is None else raised(job, pickle.loads(self.error))
-
-
-class JobProcess:
-    """The near end of a process that does jobs. context: of multiprocessing.
-
-    Quick jobs share a process, see ``takes``. Ended, it takes with it all that its jobs started.
-    """
+class _JobProcess:
+    """The near end of a process that does jobs. Ended, it takes with it all that its jobs started."""
 
     def __init__(self, context: Any) -> None:
         self.connection, far = context.Pipe()
@@ -171,69 +110,50 @@ class JobProcess:
         with processes.interrupts_deferred(), processes.main_module_hidden():
             self._process.start()
         far.close()
-        self.young_since = time.monotonic()
-        self._kills = 0
-        self._sent: set[str] = set()
-        self._job: Job[Any] | None = None  # the last one, without its argument
-        self.deadline: float | None = None  # of the job, by time.monotonic
+        self._began = time.monotonic()
+        self._sent: tuple[str, ...] = ()  # names of shared objects that are there
 
     @property
     def signs(self) -> tuple[Connection, int]:
         """What multiprocessing's ``wait`` takes: ready when ``receive`` has something to tell."""
         return self.connection, self._process.sentinel
 
-    def takes(self, job: Job[Any]) -> bool:
-        """True if it may do the job: a job with a limit gets a fresh process, others one that is young."""
-        if self._job is None:
-            return True
-        young = time.monotonic() - self.young_since <= (_OWN if job.own else _YOUNG)
-        return young and not job.limited and self._process.is_alive()
+    @property
+    def usable(self) -> bool:
+        """True if it may do a further job."""
+        return time.monotonic() - self._began <= _LIFE and self._process.is_alive()
 
-    def give(self, job: Job[Any], keep: Callable[[str, Any], Any]) -> None:
-        """Begin a job. keep: called there with the key and the result; what it returns is the end's ``answer``."""
-        self._job, self._kills = replace(job, argument=None, shared=()), oom_kills()
-        if isinstance(packed := job.argument, PackedJob) and packed.kept:
-            missing = {name: content for name, content in packed.shared.items() if name not in self._sent}
-            job, self._sent = replace(job, argument=replace(packed, shared=missing)), {*packed.names}
-        self.deadline = None if job.seconds is None else time.monotonic() + job.seconds
+    def give(self, job: PackedJob, *given: Any, shared: Mapping[str, bytes]) -> None:
+        """Begin a job. given: ``encode`` and ``plugins`` of ``Processes.events``."""
+        self.job, self._kills = job, _oom_kills()
+        self._deadline = None if job.seconds is None else time.monotonic() + job.seconds
+        missing = {name: shared[name] for name in job.names if name not in self._sent}
+        self._sent = job.names
         with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
-            self.connection.send((job, keep))
-
-    def events(self) -> Iterator[Progress | JobEnd]:
-        """Reports of the job that have come, and its end; of one that reports without pause some: others wait, too."""
-        return islice(iter(self.receive, None), _AT_ONCE)
+            self.connection.send((job, missing, *given))
 
     def receive(self) -> Progress | JobEnd | None:
         """A report or the end of the job, None if there is none yet. After an end by force the process is gone."""
-        over = self.deadline is not None and time.monotonic() >= self.deadline
         dead = not self._process.is_alive()  # asked before what it sent is read, so that nothing is left when it died
         try:
             if self.connection.poll():
                 message: Progress | JobEnd = self.connection.recv()
-                if isinstance(message, JobEnd) or dead or not over:
-                    return message
+                return message
         except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
             self._process.join(_CLOSED)
             dead = True
         if dead:
-            return self._death()
-        if over:
-            assert self._job is not None
-            self.end()
-            return JobEnd(lost=Failure(f"over time (limit {self._job.seconds:g} s)", over_time=True))
+            code = 1 if self._process.is_alive() else self._process.exitcode or 0
+            how = f"exit code {code}" if code >= 0 else f"killed by {Signals(-code).name}"
+            if code == -SIGKILL and _oom_kills() > self._kills:
+                how += ": the system was out of memory"
+            elif code in (-SIGABRT, -SIGSEGV) and self.job.memory_mb is not None:
+                how += f"; its memory was limited to {self.job.memory_mb:g} MB"  # compiled code may end so without
+            reason = f"the process died without an answer ({how})"
+            return JobEnd(failure=Failure(reason, killed=-code in _FROM_OUTSIDE))
+        if self._deadline is not None and time.monotonic() >= self._deadline:
+            return JobEnd(failure=Failure(f"over time (limit {self.job.seconds:g} s)", over_time=True))
         return None
-
-    def _death(self) -> JobEnd:
-        """The end of a job whose process has died; of one that cannot be heard any more, too, which is ended."""
-        code = 1 if self._process.is_alive() else self._process.exitcode or 0
-        self.end()
-        how = f"exit code {code}" if code >= 0 else f"killed by {Signals(-code).name}"
-        if code == -SIGKILL and oom_kills() > self._kills:
-            how += ": the system was out of memory"
-        elif code in (-SIGABRT, -SIGSEGV) and self._job is not None and self._job.memory_mb is not None:
-            how += f"; its memory was limited to {self._job.memory_mb:g} MB"  # compiled code may end so without memory
-        reason = f"the process died without an answer ({how})"
-        return JobEnd(lost=Failure(reason, killed=-code in _FROM_OUTSIDE))
 
     def end(self) -> None:
         """End the process and all that its jobs started."""
@@ -244,125 +164,61 @@ class JobProcess:
         self.connection.close()
 
 
-def process_for(job: Job[Any], idle: list[JobProcess], context: Any) -> JobProcess:
-    """An idle process that may take the job, or a new one; in place of an idle one that may not, which is ended."""
-    with suppress(IndexError):  # another thread has taken the last
-        process = idle.pop()
-        if process.takes(job):
-            return process
-        process.end()
-    return JobProcess(context)
-
-
-def release(process: JobProcess, end: JobEnd, idle: list[JobProcess]) -> None:
-    """Keep a process whose job has ended for the next one, or end it if the job has left something behind."""
-    if end.reusable:
-        process.young_since += end.unpacking
-        idle.append(process)
-    else:
-        process.end()
-
-
 def _serve(connection: Connection) -> None:
-    """Do the jobs that come through the connection."""
-    global _in_job, _unpacked
+    """Do the jobs that come through the connection; end when none comes for long."""
+    global _in_job
     _in_job = True
     signal.signal(SIGINT, SIG_IGN)  # the parent ends it
     signal.signal(SIGTERM, SIG_DFL)  # end at once: Python's handlers would wait for compiled code
+    cast(TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)  # what it prints does not end with it
     os.setpgid(0, 0)  # all that a plug-in starts can be ended with the process
     threading.Thread(target=processes.end_with_parent, daemon=True).start()
-    process, home = os.getpid(), _folder()
+    shared: dict[str, Any] = {}
     with processes.one_thread():
-        while True:
+        while connection.poll(2 * _LIFE):
+            end = _do(connection, shared)
             try:
-                if not connection.poll(2 * _OWN):  # nobody gives it a job so late
-                    return
-                came = time.monotonic()
-                job, keep = connection.recv()
-                _unpacked = time.monotonic(), _condition()
-            except EOFError:
-                return
-            except Exception as error:  # whatever unpickling raises: a module that is missing here
-                connection.send(JobEnd(error=_sendable(error)))
-                return
-            end = _do(job, keep, connection, process)
-            unpacked_at, condition = _unpacked
-            unchanged = _condition() == condition and _folder() == home
-            reusable = end.error is None and not job.limited and unchanged
-            for stream in (sys.stdout, sys.stderr):
-                with suppress(OSError, ValueError):  # closed by a plug-in
-                    stream.flush()
-            try:
-                connection.send(replace(end, reusable=reusable, unpacking=unpacked_at - came))
+                connection.send(end)
             except OSError:  # a plug-in has closed it
                 os._exit(1)
 
 
-def _do(job: Job[Any], keep: Callable[[str, Any], Any], connection: Connection, process: int) -> JobEnd:
-    """Run a job: its answer, or the error that it raised. process: the id of this one."""
+def _do(connection: Connection, shared: dict[str, Any]) -> JobEnd:
+    """Take a job and run it. shared: objects of the job before, and then of this one, by name."""
+    sent: Progress | None = None
+    last: Progress | None = None
+    sent_at, process, memory_mb = 0.0, os.getpid(), None
 
     def report(event: Progress) -> None:
-        with suppress(OSError):  # a plug-in may have closed it
-            connection.send(event)
+        nonlocal sent, sent_at, last
+        last = event
+        if sent is None or event.task != sent.task or time.monotonic() - sent_at >= _PERIOD:
+            with suppress(OSError):  # a plug-in may have closed it
+                connection.send(event)
+            sent, sent_at = event, time.monotonic()
 
     try:
-        with limited_memory(job.memory_mb):
-            result = job.function(job.argument, report)
+        job, missing, encode, plugins = connection.recv()
+        memory_mb = job.memory_mb
+        import_copies(plugins)
+        shared.update({name: pickle.loads(content) for name, content in missing.items()})
+        missing.clear()
+        for name in shared.keys() - set(job.names):
+            del shared[name]
+        unpickler = pickle.Unpickler(BytesIO(job.content))
+        unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
+        function, argument = unpickler.load()
+        try:
+            if memory_mb is not None:
+                limit_memory(memory_mb)
+            result = function(argument, report)
+        finally:
+            limit_memory(None)  # there is room for reporting an error
             if os.getpid() != process:  # a plug-in forked: its copy of this process has no answer to give
                 os._exit(0)
-            return JobEnd(keep(job.key, result))
-    except BaseException as error:
-        if os.getpid() != process:
-            os._exit(1)
-        return JobEnd(error=_sendable(error))
-
-
-def _folder() -> str:
-    """The working folder, empty if it has been removed."""
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
-
-
-def _condition() -> tuple[Any, ...]:
-    """What a job may change in its process for those that follow, beside the working folder."""
-    try:
-        os.waitpid(-1, os.WNOHANG)
-        has_children = True
-    except ChildProcessError:
-        has_children = False
-    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
-    return has_children, dict(os.environ), handlers, threading.active_count(), list(sys.path)
-
-
-class _InWordsError(Exception):
-    """An error in words, in the place of one that cannot be pickled."""
-
-
-def _sendable(error: BaseException) -> bytes:
-    try:
-        content = pickle.dumps(error)
-        pickle.loads(content)
-    except Exception:  # whatever the error's class raises
-        return pickle.dumps(_InWordsError(_in_words(error)))
-    return content
-
-
-def raised(job: Job[Any], error: BaseException) -> Failure:
-    """The failure of a job that raised an error."""
-    if isinstance(error, MemoryError):
-        return Failure(
-            "out of memory" if job.memory_mb is None else f"out of memory (limit {job.memory_mb:g} MB)", error
-        )
-    return Failure(str(error) if isinstance(error, _InWordsError) else _in_words(error), error)
-
-
-def _in_words(error: BaseException) -> str:
-    return one_line(f"{type(error).__name__}: {error}")
-
-
-_LONGEST = 3600.0  # s of one wait: the system takes no infinite time
+        return JobEnd(encode(result), last=last)
+    except BaseException as error:  # whatever a plug-in raises
+        return JobEnd(failure=failure_of(error, memory_mb), last=last)
 
 
 def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
@@ -373,62 +229,90 @@ def local_backend(workers: int, preload: Sequence[str] = ()) -> Backend:
 class InPlace:
     """Runs jobs one after the other in this process. Their limits are not enforced."""
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run the jobs, see Backend."""
         for number, job in jobs:
             watch.began(number)
-            failure = None
             try:
                 with processes.one_thread():
-                    job.run(store, partial(watch.moved, number))
+                    end = JobEnd(encode(job.function(job.argument, partial(watch.moved, number))))
             except (Exception, SystemExit) as error:
-                failure = raised(job, error)
-            yield Ended(number, job, failure)
+                end = JobEnd(failure=failure_of(error, None))
+            yield number, job, end
 
 
 @dataclass(frozen=True)
 class Processes:
     """Runs jobs in processes of one thread, up to ``workers`` of them at a time.
 
-    A job with a limit of time or memory, one that begins when a process is a second old (imports do not count), and one
-    after a job that raised or left something behind (a working folder, threads, children) has a fresh process; quick
-    jobs share one, and those of our own code share it for a minute.
-    preload: modules that the processes share, so that they need not be imported for every job. Within a job there are
-    no further processes: it runs its jobs itself. lasting: processes that have nothing to do wait for the next run,
-    until ``close``.
+    A job with a limit of time or memory has a process of its own; others share processes, each for a minute or until a
+    job fails. Within a job there are no further processes: it runs its jobs itself. preload: modules that the processes
+    share, so that they need not be imported for every job. lasting: processes that have nothing to do wait for the next
+    run, until ``close``.
     """
 
     workers: int
     preload: Sequence[str] = ()
     lasting: bool = False
-    _idle: list[JobProcess] = field(default_factory=list, init=False, repr=False, compare=False)
+    _idle: list[_JobProcess] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    def run(self, jobs: Iterable[tuple[int, Job[T]]], store: Store[T], watch: JobWatch[T]) -> Iterator[Ended]:
+    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
         """Run the jobs, see Backend."""
-        # A process that does a job starts no further ones
         if _in_job:
-            yield from InPlace().run(jobs, store, watch)
+            yield from InPlace().run(jobs, encode, watch)
             return
+        packer, taken = Packer(), dict[int, Job[T]]()
+
+        def packed() -> Iterator[tuple[int, PackedJob]]:  # which is asked for a job when a process is free
+            for number, job in jobs:
+                taken[number] = job
+                watch.began(number)
+                yield number, packer.pack(job)
+
+        with closing(self.events(packed(), packer.shared, encode)) as events:
+            for number, event in events:
+                if isinstance(event, JobEnd):
+                    yield number, taken.pop(number), event
+                else:
+                    watch.moved(number, event)
+
+    def events(
+        self,
+        jobs: Iterable[tuple[int, PackedJob]],
+        shared: Mapping[str, bytes],
+        encode: Encode,
+        plugins: Mapping[Path, Path] | None = None,
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> Generator[tuple[int, Progress | JobEnd], None, None]:
+        """Run packed jobs and yield their reports and ends; all stop once ``wanted`` is false.
+
+        shared: contents of what they share. plugins: copies of plug-in files here, by their paths at home.
+        """
         waiting = iter(jobs)
-        active: dict[JobProcess, tuple[int, Job[Any]]] = {}
-        idle, packer = self._idle, Packer()
+        active: dict[_JobProcess, int] = {}
         with processes.one_thread_processes((*PRELOAD, *self.preload)) as context:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:
                         number, job = item
-                        process = process_for(job, idle, context)
-                        active[process] = item
-                        process.give(packer.portable(job) if job.own and job.shared else job, store.keep)
-                        watch.began(number)
-                    if not active:
+                        while self._idle and not self._idle[-1].usable:
+                            self._idle.pop().end()
+                        process = self._idle.pop() if self._idle and not job.limited else _JobProcess(context)
+                        active[process] = number
+                        process.give(job, encode, plugins or {}, shared=shared)
+                    if not active or not wanted():
                         return
-                    for process, end in _ends(active, watch):
-                        number, job = active.pop(process)
-                        if end.answer is not None:
-                            store.put_content(job.key, end.answer)
-                        release(process, end, idle)
-                        yield Ended(number, job, end.failure(job))
+                    wait([sign for process in active for sign in process.signs], timeout=_PERIOD)
+                    for process, number in [*active.items()]:
+                        event = process.receive()
+                        if isinstance(event, JobEnd):
+                            del active[process]
+                            if event.failure is None and not process.job.limited:
+                                self._idle.append(process)
+                            else:
+                                process.end()
+                        if event is not None:
+                            yield number, event
             finally:
                 for process in active:
                     process.end()
@@ -439,20 +323,3 @@ class Processes:
         """End the processes that wait."""
         while self._idle:
             self._idle.pop().end()
-
-
-def _ends(active: dict[JobProcess, tuple[int, Job[Any]]], watch: JobWatch[Any]) -> list[tuple[JobProcess, JobEnd]]:
-    """Wait until a job reports, ends or is over its time; reports are passed on. The jobs that have ended."""
-    deadlines = [process.deadline for process in active if process.deadline is not None]
-    wait(
-        [sign for process in active for sign in process.signs],
-        timeout=min(max(min(deadlines) - time.monotonic(), 0.0), _LONGEST) if deadlines else None,
-    )
-    ended = []
-    for process, (number, _) in active.items():
-        for event in process.events():
-            if isinstance(event, JobEnd):
-                ended.append((process, event))
-                break
-            watch.moved(number, event)
-    return ended

@@ -1,5 +1,6 @@
 """Clusters of Dask that an address joins: machines that differ, faults of scheduler and client, TLS."""
 
+import contextlib
 import os
 import shutil
 import signal
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import distribution, version
 from pathlib import Path
 
+import psutil
 import pytest
 from commands import (
     ENVIRONMENT,
@@ -267,3 +269,37 @@ def test_a_comparison_over_tls_equals_one_by_processes(tmp_path: Path) -> None:
         assert line.startswith(f"no Dask scheduler answers at {place} (")
     compared(config, tmp_path / "processes")
     assert without_seconds(tmp_path / "tls") == without_seconds(tmp_path / "processes")
+
+
+@pytest.mark.parametrize("kills", [1, 1000])
+def test_a_worker_that_is_killed_as_it_starts_is_started_again_or_one_line_says_what_to_do(
+    kills: int, tmp_path: Path
+) -> None:
+    (tmp_path / "go_on").touch()
+    command = [sys.executable, "-c", CLIENT, "dask", str(tmp_path)]
+    client = subprocess.Popen(command, env=IMPORTING_THIS, stderr=subprocess.PIPE, text=True)
+    killed: set[int] = set()
+    while client.poll() is None:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for process in psutil.Process(client.pid).children(recursive=True):
+                if "spawn_main" in " ".join(process.cmdline()) and len(killed) < kills:
+                    process.kill()
+                    killed.add(process.pid)
+    told = client.communicate()[1]
+    assert killed
+    if kills == 1:
+        assert (client.returncode, told) == (0, "")
+        assert len(list((tmp_path / "store").glob("*.json"))) == 5
+    else:
+        assert told.startswith("no workers of Dask start here (")
+        assert told.endswith("take fewer workers, then the same command\n")
+
+
+def test_a_comparison_on_dask_goes_on_beside_four_busy_programs(tmp_path: Path) -> None:
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+    try:
+        compared(write_config(tmp_path), tmp_path / "out", "--backend", "dask")
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()

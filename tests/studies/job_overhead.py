@@ -33,7 +33,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seconds = arguments.milliseconds / 1000
     jobs = [Job(f"job-{number}", busy, (number, seconds)) for number in range(arguments.jobs)]
-    content, _ = Packer().pack(jobs[0])
+    content = Packer().pack(jobs[0]).content
     print(f"{os.cpu_count()} processors; a job's function and argument: {len(content)} bytes, pickled whole "
           f"{len(pickle.dumps(jobs[0]))}")  # fmt: skip
     for name in arguments.backend or ("processes", "dask"):
