@@ -116,9 +116,9 @@ def list_(plugins: list[Path] | None = shared.PLUGINS, as_json: bool = shared.JS
 
     Each with where it comes from: built in, a plug-in's file, or an installed package.
     """
-    from omnibench.cli.terminal.tables import print_table
     from omnibench.registry import REGISTRIES, Entry
     from omnibench.report.blocks import Column, Row, Table
+    from omnibench.report.terminal import print_table
 
     failures = shared.load_given_plugins(plugins)
     if as_json:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,51 @@ from omnibench.report.numbers import (
     percent,
     significant,
 )
+from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
+
+
+class DesignResult(Result):
+    """A design. folder: where its files are, None if nowhere."""
+
+    def __init__(self, design: Design, folder: Path | None = None) -> None:
+        self.design, self.folder = design, folder
+
+    def opening(self) -> Sequence[Remark]:
+        design, use = self.design, USE_IN_WORDS[self.design.use]
+        simulated = " (simulated data)" if design.simulated else ""
+        kind = simulated if design.recorded else " (assumed)"
+        first = f"{design.name}{kind}: robot {design.robot}, D-optimal per {design.per}, {use}"
+        return [Remark(first), Remark(origin_in_words(design))]
+
+    def tables(self) -> Sequence[page.Table]:
+        design = self.design
+        of_sets = [(chosen_table(design, each), effort_table(design, each)) for each in design.sets]
+        return [*(table for tables in of_sets for table in tables), equal_table(design)]
+
+    def remarks(self) -> Sequence[Remark]:
+        lines = []
+        for of_set in self.design.sets:
+            lines += [choice_in_words(self.design, of_set), motions_in_words(of_set)]
+            if not self.design.recorded:
+                lines += ["What to drive:", *(f"  {each}" for each in plan_in_words(self.design, of_set))]
+        lines += [f"- {note}" for note in self.design.notes]
+        lines += [] if self.folder is None else [f"report: {self.folder / 'report.html'}"]
+        return list(map(Remark, lines))
+
+    def next_step(self) -> NextStep:
+        what = plural(self.design.sets[0].step.effort.runs, "run")
+        drive = "drive them and make a data set of the recordings (omnibench guide data)"
+        return NextStep(f"{what} tell the most of {self.design.robot}", drive)
+
+    def document(self) -> page.Document:
+        return design_document(self.design)
+
+    def json(self) -> Design:
+        return self.design
+
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
 UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}

@@ -134,9 +134,7 @@ def _templates() -> Templates:
     source = environment.loader.get_source
     # The name of an option is not broken at its dashes.
     option = r'<span class="option">\g<0></span>'
-    environment.filters["prose"] = lambda words: Markup(
-        re.sub(r"(?<!\S)--[a-z][a-z-]+", option, html.escape(words))
-    )
+    environment.filters["prose"] = lambda words: Markup(re.sub(r"(?<!\S)--[a-z][a-z-]+", option, html.escape(words)))
     # Words may break after an underscore, too: long names must not widen a table beyond a phone or paper.
     environment.filters["breakable"] = lambda words: Markup(escape(words).replace("_", Markup("_<wbr>")))
     environment.filters["plot_json"] = lambda figure: _json(json.loads(figure.to_json()))

@@ -6,9 +6,7 @@ from functools import partial
 
 from rich.console import Console
 
-from omnibench.cli.terminal.calibration_tables import how_to_use
 from omnibench.cli.terminal.console import print_ending
-from omnibench.cli.terminal.tables import print_table
 from omnibench.compare.output import calibration_file
 from omnibench.compare.report.cost_tables import cost_table
 from omnibench.compare.report.error_figures import final_error_table
@@ -16,7 +14,9 @@ from omnibench.compare.report.outcome_tables import entry_table, run_table
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
 from omnibench.report.blocks import Cell, Column, Row, Table
+from omnibench.report.calibration_report import how_to_use
 from omnibench.report.numbers import NOTHING, fixed
+from omnibench.report.terminal import print_table
 from omnibench.robot.calibration import read_calibration
 from omnibench.study.report import cell_words
 from omnibench.study.study_result import StudyResult, mean_ratio
@@ -47,7 +47,8 @@ def print_comparison_ending(result: ComparisonResult) -> None:
         print_ending(f"{compared} in {result.output}", "read report.html in that folder")
     elif best.verdict.verdict == "better":
         outcome = f"{compared}; the best on {name}, {best.label}, beats the design on runs held out"
-        print_ending(outcome, *how_to_use(read_calibration(file), file))
+        then, command = how_to_use(read_calibration(file), file)
+        print_ending(outcome, then, *command)
     else:
         unsure = f"{compared}; that the best on {name}, {best.label}, beats the design was not shown by runs held out"
         print_ending(unsure, f"read {result.output / 'report.html'} and record more runs for validation")
