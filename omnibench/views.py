@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     import polars as pl
 
-    from omnibench.report.result import Result
-
 # Module and class of the result, by the class that is shown: a plug-in's may be called the same.
 _RESULTS = {
     "omnibench.robot.calibration.Calibration": ("report.calibration_report", "CalibrationResult"),
@@ -131,14 +129,13 @@ def _shortened(value: Any) -> str:
     return words if len(words) <= _VALUE else f"<{type(value).__name__}>"
 
 
-def _result(shown: Shown) -> Result:
+def _result(shown: Shown) -> Any:
     """The result of an object, by its class."""
     kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(shown).__mro__)
     module, name = next(_RESULTS[kind] for kind in kinds if kind in _RESULTS)
-    result: Result = getattr(import_module(f"omnibench.{module}"), name)(shown)
-    return result
+    return getattr(import_module(f"omnibench.{module}"), name)(shown)
 
 
 def _of_reports(name: str) -> Any:
     """A renderer of the room above."""
-    return getattr(import_module("omnibench.report.result"), name)
+    return getattr(import_module("omnibench.report.terminal"), name)

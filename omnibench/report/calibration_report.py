@@ -148,15 +148,14 @@ class CalibrationResult(Result):
 
     def _elements(self) -> page.Table:
         """The elements of a matrix that has no reading as parameters, a row each, as parameters are shown."""
-        rows = []
-        for row in self._matrix().iter_rows(named=True):
-            ends = [row.get(end) for end in ("low", "high")]
-            known = all(end is not None for end in ends) and ends[0] != ends[1]
-            interval = f"{ends[0]:+.7f} to {ends[1]:+.7f}" if known else NOTHING
-            change = (row["value"] / row["design"] - 1) if row["design"] else math.nan
+        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
+        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
+        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
+            low, high = row.get("low"), row.get("high")
+            interval = NOTHING if low is None or low == high else f"{low:+.7f} to {high:+.7f}"
             values = (f"{row[name]:+.7f}" for name in ("design", "value"))
             rows.append(
-                page.Row.of(f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(change), interval)
+                page.Row.of(f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(float(share)), interval)
             )
         columns = (page.Column(name) for name in ("design", "value", "", "change", "95 %"))
         heading = page.Column(self._heading, numeric=False)

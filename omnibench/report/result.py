@@ -1,27 +1,24 @@
 """A result that shows itself: what it says, and its renderers for a terminal, a page, a notebook and a prompt.
 
-A command makes a result and hands it to :func:`omnibench.report.terminal.show`; the public objects of Python find
-theirs through ``omnibench.views``. All of them show the same tables and figures.
+A command makes a result and hands it to the renderer of ``omnibench.report.terminal``; the public objects of Python
+find theirs through ``omnibench.views``. All of them show the same tables and figures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from omnibench.report.blocks import Column, Document, FigureGrid, Paragraph, Row, Section, Table, Tone, answer_section
-from omnibench.views import screenful
+from omnibench.report.blocks import Column, Document, FigureGrid, Row, Section, Table, Tone, answer_section
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
     from pydantic import BaseModel
 
-_ROWS = 8  # of a table at a prompt and in a notebook
-_WIDTH = 116  # columns of a text at a prompt
+ROWS = 8  # of a table at a prompt and in a notebook
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,7 @@ class Result:
 
     def tables(self) -> Sequence[Table]:
         """The tables of the answer, the most important first."""
-        return [frame_table(make()) for make in list(self.frames().values())[:1]]
+        return ()
 
     def remarks(self) -> Sequence[Remark]:
         """Lines below the tables."""
@@ -95,39 +92,11 @@ class Result:
         return drawn(self.figures()[0])
 
 
-def as_text(result: Result) -> str:
-    """A result at a Python prompt: at most twenty lines of at most 120 characters."""
-    from rich.console import Console
-
-    from omnibench.report.terminal import render_table
-
-    console = Console(file=StringIO(), width=_WIDTH, markup=False, emoji=False, highlight=False, color_system=None)
-    for table in result.tables():
-        console.print(render_table(_head(table), console.width))
-    below = [remark.text for remark in result.remarks()]
-    tables: str = console.file.getvalue()  # type: ignore[attr-defined]
-    lines = [result.title, result.sentence(), *(f"  {line}".rstrip() for line in tables.splitlines()), *below]
-    return "\n".join(screenful(line for line in lines if line))
-
-
-def as_html(result: Result) -> str:
-    """A result in a notebook: title, sentence, tables and remarks, by the template of the pages."""
-    from omnibench.report.render import fragment
-
-    texts = [result.title, result.sentence(), *(remark.text for remark in result.remarks())]
-    first, *others = [Paragraph(text) for text in texts if text]
-    return fragment([Paragraph(first.text, "lead"), *map(_head, result.tables()), *others])
-
-
 def frame_table(frame: pl.DataFrame) -> Table:
     """The head of a data frame as a table."""
     columns = tuple(Column(name, numeric=dtype.is_numeric()) for name, dtype in frame.schema.items())
-    rows = tuple(Row.of(*map(_cell, row)) for row in frame.head(_ROWS).iter_rows())
-    return Table("", columns, rows, f"the first {_ROWS} of {len(frame):,} rows" if len(frame) > _ROWS else "")
-
-
-def _head(table: Table) -> Table:
-    return Table(table.caption, table.columns, table.rows[:_ROWS], table.note)
+    rows = tuple(Row.of(*map(_cell, row)) for row in frame.head(ROWS).iter_rows())
+    return Table("", columns, rows, f"the first {ROWS} of {len(frame):,} rows" if len(frame) > ROWS else "")
 
 
 def _cell(value: Any) -> str:

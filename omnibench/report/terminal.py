@@ -1,8 +1,9 @@
-"""Results and tables on a terminal, by rich; lesser columns give way where there is no room."""
+"""Results and tables on a terminal, by rich, at a prompt and in a notebook."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import StringIO
 from typing import Final, Literal
 
 from rich.box import SIMPLE_HEAD
@@ -10,9 +11,11 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table as Lines
 from rich.text import Text
 
-from omnibench.report.blocks import Cell, Table
-from omnibench.report.result import Remark, Result
+from omnibench.report.blocks import Cell, Paragraph, Table
+from omnibench.report.result import ROWS, Remark, Result, frame_table
+from omnibench.views import screenful
 
+_WIDTH: Final = 116  # columns of a text at a prompt
 _READABLE: Final = 18  # columns of text; lesser columns are left out before text is squeezed into fewer; chosen
 _UNBROKEN: Final = 30  # columns; a longer word, such as a path, may be broken
 _STYLES: Final = {"best": "bold", "failed": "yellow", "muted": "dim", "group": "bold dim"}
@@ -105,3 +108,28 @@ def _extent(table: Table, index: int, between: str) -> tuple[int, int]:
     if not column.numeric and any(each.priority for each in table.columns):
         least = max(least, min(longest, _READABLE))
     return least, max(least, longest, (len(heading) + 1) // 2)
+
+
+def as_text(result: Result) -> str:
+    """A result at a Python prompt: at most twenty lines of at most 120 characters."""
+    console = Console(file=StringIO(), width=_WIDTH, markup=False, emoji=False, highlight=False, color_system=None)
+    for table in result.tables():
+        console.print(render_table(_head(table), console.width))
+    below = [remark.text for remark in result.remarks()]
+    tables: str = console.file.getvalue()  # type: ignore[attr-defined]
+    lines = [result.sentence(), *tables.splitlines(), *below]
+    return "\n".join(screenful([result.title, *(f"  {line}".rstrip() for line in lines if line.strip())]))
+
+
+def as_html(result: Result) -> str:
+    """A result in a notebook: title, sentence, tables and remarks, by the template of the pages."""
+    from omnibench.report.render import fragment
+
+    texts = [result.title, result.sentence(), *(remark.text for remark in result.remarks())]
+    first, *others = [Paragraph(text) for text in texts if text]
+    tables = result.tables() or [frame_table(make()) for make in list(result.frames().values())[:1]]
+    return fragment([Paragraph(first.text, "lead"), *map(_head, tables), *others])
+
+
+def _head(table: Table) -> Table:
+    return Table(table.caption, table.columns, table.rows[:ROWS], table.note)

@@ -14,6 +14,7 @@ from commands import CONFIGS, ROOT, Command, Prepared, assert_refused, run_here,
 from markdown_it import MarkdownIt
 from newcomer import ELSEWHERE, lines_of, typed_here
 from newcomer import PAGES as TYPED_PAGES
+from omnibench.cli.terminal.calibration_tables import print_calibration
 from pydantic import TypeAdapter
 from real_recordings import OPTIODOM
 from report_page import on_terminal
@@ -23,7 +24,6 @@ import omnibench
 from omnibench.cli import examples
 from omnibench.cli.examples import EXAMPLES, SAMPLES, Example, find_example, write_example
 from omnibench.cli.handbook_topics import HANDBOOK, topics
-from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.config import read_model
 from omnibench.data.recording import RobotOption

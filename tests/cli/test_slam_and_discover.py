@@ -22,17 +22,18 @@ from recording_samples import in_room
 from report_page import Page, on_terminal
 from sessions import until
 
-from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.discover.output import DiscoverOptions, write_discovery
+from omnibench.discover.report.discovery_result import DiscoveryResult
 from omnibench.discover.result import Discovery
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate
 from omnibench.registry import effects, load_plugins
+from omnibench.report.terminal import print_result, print_table
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
@@ -481,9 +482,10 @@ SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
 
 @pytest.mark.parametrize("make", SHOWN)
 def test_what_is_found_is_told_on_a_screen_of_eighty_columns(make: Callable[[], Discovery]) -> None:
-    lines = on_terminal(print_discovery, make(), Path("results/flower/now")).splitlines()
-    assert max(len(line.rstrip()) for line in lines) <= 80
-    text = " ".join(" ".join(lines).split())
+    result = DiscoveryResult(make(), Path("results/flower/now"))
+    for table in result.tables():
+        assert max(len(line.rstrip()) for line in on_terminal(print_table, table).splitlines()) <= 80
+    text = " ".join(on_terminal(print_result, result).split())
     assert "…" not in text
     for part in SHOWN[make]:
         assert part in text

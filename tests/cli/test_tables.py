@@ -5,7 +5,6 @@ import pty
 import re
 import subprocess
 from contextlib import suppress
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -22,11 +21,8 @@ from wheeled_recordings import PERIOD as RECORDED
 from wheeled_recordings import recorded
 from wheeled_samples import driven
 
-from omnibench.cli.terminal.calibration_tables import print_calibration
-from omnibench.cli.terminal.comparison_tables import print_result
+from omnibench.cli.terminal.comparison_tables import print_result as print_comparison
 from omnibench.cli.terminal.progress_display import ProgressDisplay
-from omnibench.cli.terminal.recording_tables import print_inspection
-from omnibench.cli.terminal.tables import in_brief, print_table
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.fit.calibrate import calibrate
@@ -34,7 +30,11 @@ from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget
 from omnibench.progress import Progress, Stages
 from omnibench.report.blocks import Cell, Column, Document, Row, Section, Table
+from omnibench.report.calibration_report import CalibrationResult
+from omnibench.report.recording.inspection_report import InspectionResult
 from omnibench.report.render import render
+from omnibench.report.result import Result
+from omnibench.report.terminal import print_result, print_table
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.testing.synthetic import PERIOD, synthetic_trajectories
 
@@ -80,10 +80,6 @@ def test_a_path_may_be_broken_where_it_is_longer_than_a_column_can_be() -> None:
     assert "".join(printed(table, 40).split()).endswith(f"de{path}")
 
 
-def test_in_brief_a_table_has_neither_notes_nor_lesser_columns(snapshot: SnapshotAssertion) -> None:
-    assert printed(in_brief(TABLE), 160) == snapshot
-
-
 def test_one_description_gives_the_cells_of_the_report_and_of_the_terminal() -> None:
     page = Page(render(Document("Report", "", (Section("costs", "Costs", (TABLE,)),))))
     shown = [[" ".join(cell.split()) for cell in row] for row in page.tables[TABLE.caption]]
@@ -116,7 +112,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
 
 
 def compared_text(result: ComparisonResult, width: int) -> str:
-    return on_terminal(print_result, result, width=width)
+    return on_terminal(print_comparison, result, width=width)
 
 
 def test_all_entries_are_in_every_table_in_usual_units(result: ComparisonResult, snapshot: SnapshotAssertion) -> None:
@@ -195,8 +191,11 @@ def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(
 
 def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list[str]:
     """What is printed of a data set and its calibration."""
-    calibrated = on_terminal(print_calibration, calibrate(dataset, *arguments, **options), width=160)
-    return (calibrated + on_terminal(print_inspection, inspect_dataset(dataset), width=160)).splitlines()
+    results: tuple[Result, ...] = (
+        CalibrationResult(calibrate(dataset, *arguments, **options)),
+        InspectionResult(inspect_dataset(dataset)),
+    )
+    return "".join(on_terminal(print_result, each, width=160) for each in results).splitlines()
 
 
 def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
@@ -210,23 +209,26 @@ def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
 def test_a_calibration_shows_physical_parameters_then_the_matrix_on_a_screen_of_80_columns(robot: Robot) -> None:
     runs = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(5))
     run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), mount="fit")
-    lines = on_terminal(print_calibration, run, ["file", "verdict", "next", "COMMAND"], width=80).splitlines()
-    assert len(lines) <= 25 - 4
+    result = CalibrationResult(run, file=Path("c.yaml"))
+    lines = on_terminal(print_result, result, width=80).splitlines()
+    assert len(lines) <= 25 - 3 - 2 * len(run.warnings)  # the sentence with the command, and the warnings
     names = [each.name for each in run.parameters]
     assert [line.split()[0] for line in lines if line.split()[0] in names] == names
     first = next(number for number, line in enumerate(lines) if line.startswith("matrix"))
     assert first > max(number for number, line in enumerate(lines) if line.split()[0] in names)
-    in_tables = [line for line in lines if not line.startswith(("converged", "95 %", "noise"))]
-    assert max(map(len, in_tables)) <= 80
     shown = " ".join(" ".join(lines[first:]).split())
     elements = [f"{value:+.7f}" for value in run.calibration.matrix_array.ravel()]
-    assert all(each in shown for each in elements) or lines[first].startswith("matrix (3 x 8): not on this screen")
+    assert all(each in shown for each in elements) or re.match(r"matrix \(3 x \d\): not on this screen", lines[first])
 
 
 def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> None:
     runs = recorded(DIFFERENTIAL, 1.02 * DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
     run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
-    row = next(line for line in on_terminal(print_calibration, run).splitlines() if line.startswith("radius_left"))
+    row = next(
+        line
+        for line in on_terminal(print_result, CalibrationResult(run)).splitlines()
+        if line.startswith("radius_left")
+    )
     (radius,) = (each for each in run.parameters if each.name == "radius_left")
     interval = f"{radius.low:.5f} to {radius.high:.5f}"
     assert (
@@ -235,28 +237,27 @@ def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> No
     )
 
 
-def test_without_a_reading_the_matrix_is_shown_alone() -> None:
-    runs = recorded(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
-    run = replace(calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs)), parameters=())
-    assert on_terminal(print_calibration, run).startswith("diff map\nmatrix ")
-
-
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
     runs = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(5))
     lines = calibration_lines(make_dataset("tricycle", TRICYCLE, RECORDED, runs))
     assert any(line.startswith("mount_x") for line in lines)
 
 
-def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> None:
+def test_without_a_reading_each_element_has_a_row_and_one_that_is_0_but_for_rounding_no_share_of_the_design() -> None:
     wheels = (Wheel(name=f"{n}", radius=0.05, distance=0.2, angle=n * 2 * np.pi / 3) for n in range(3))
     robot = Robot(name="omni", wheels=tuple(wheels))
     assert 0 < abs(robot.inverse_kinematic_matrix[0, 0]) < 1e-15
     dataset = make_dataset("omni", robot, PERIOD, synthetic_trajectories(robot))
-    text = "\n".join(calibration_lines(dataset, "random_search", budget=Budget(evaluations=200)))
-    shares = re.findall(r"([+-][\d.]+) %\)", text)
+    run = calibrate(dataset, "random_search", budget=Budget(evaluations=200))
+    assert not run.calibration.physical_parameters
+    heading, _, *rows = on_terminal(print_result, CalibrationResult(run)).splitlines()[:11]
+    assert heading.split()[-5:] == ["design", "value", "change", "95", "%"]
+    low, high = (run.to_frame()[end][1] for end in ("low", "high"))
+    assert low is None or f"{low:+.7f} to {high:+.7f}" in rows[1]
+    shares = re.findall(r"([+-][\d.]+) %", " ".join(rows))
     assert len(shares) == 8
     assert max(abs(float(share)) for share in shares) < 100
-    assert text.count("(design 0)") == 1
+    assert "design 0" in rows[0]
 
 
 ALWAYS, NEVER = 0.0, 1e9  # s between two lines of a task that goes on

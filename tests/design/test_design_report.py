@@ -12,11 +12,11 @@ from report_samples import flower
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
-from omnibench.cli.terminal.recording_tables import print_design
 from omnibench.design.candidates import DesignConfig, candidates_of_config, candidates_of_dataset
 from omnibench.design.design import Design, design_experiment
-from omnibench.design.report import design_document
+from omnibench.design.report import DesignResult, design_document
 from omnibench.report.render import write_document
+from omnibench.report.terminal import print_result
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
@@ -47,7 +47,7 @@ def page(design: Design, folder: Path) -> Page:
 
 
 def printed(design: Design, width: int = 100) -> str:
-    return on_terminal(print_design, design, width=width)
+    return on_terminal(print_result, DesignResult(design), width=width)
 
 
 def plots(told: Page) -> list[dict[str, Any]]:

@@ -11,10 +11,10 @@ import polars as pl
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.storage import reference_frame, tables_of
 from omnibench.errors import DataError
-from omnibench.report.blocks import Figure, FigureGrid
+from omnibench.report.blocks import Figure, FigureGrid, Table
 from omnibench.report.figures import START, is_drawn, marks, motion_system, path
 from omnibench.report.recording.recording_figures import REFERENCE_ITEM, all_runs
-from omnibench.report.result import Remark, Result
+from omnibench.report.result import Remark, Result, frame_table
 from omnibench.report.style import plan
 from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
@@ -30,6 +30,9 @@ class RobotResult(Result):
         mount = "" if robot.mount is None else f", tracked point at {robot.mount.x:g}, {robot.mount.y:g} m"
         wheels = plural(len(robot.wheels), "wheel")
         self.title = f"Robot {robot.name!r}: {wheels}{', skid steering' if robot.skid else ''}{mount}"
+
+    def tables(self) -> Sequence[Table]:
+        return [frame_table(self._wheels())]
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         return {"wheels": self._wheels}
@@ -50,15 +53,16 @@ class DatasetResult(Result):
 
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
-        runs, names = plural(len(dataset.trajectories), "run"), ", ".join(dataset.robot.wheel_names)
-        self.title = f"Dataset {dataset.name!r}: {runs} of robot {dataset.robot.name} (wheels {names})"
+        runs, names = dataset.trajectories, ", ".join(dataset.robot.wheel_names)
+        splits = ", ".join(f"{sum(run.split == split for run in runs)} {split}" for split in ("train", "validation"))
+        robot = f"robot {dataset.robot.name} (wheels {names})"
+        self.title = f"Dataset {dataset.name!r}: {plural(len(runs), 'run')} ({splits}) of {robot}"
 
     def sentence(self) -> str:
         runs, period = self.dataset.trajectories, 1000 * self.dataset.sample_period
-        splits = ", ".join(f"{sum(run.split == split for run in runs)} {split}" for split in ("train", "validation"))
         samples, poses = sum(run.samples.count for run in runs), sum(len(run.pose_times) for run in runs)
         kind = "simulated" if self.dataset.simulated else "recorded"
-        return f"{kind}, {splits}; {samples:,} wheel samples every {period:g} ms, {poses:,} reference poses"
+        return f"{kind}, {samples:,} wheel samples every {period:g} ms, {plural(poses, 'reference pose')}"
 
     def remarks(self) -> Sequence[Remark]:
         return [Remark(f"warning: {warning}", "warning") for warning in self.dataset.warnings[:_WARNINGS]]

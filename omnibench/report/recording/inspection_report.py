@@ -295,13 +295,13 @@ def _range(values: Array, decimals: int) -> str:
     return shown[0] if shown[0] == shown[1] else f"{shown[0]} to {shown[1]}"
 
 
-def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> page.FigureGrid:
+def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> tuple[list[page.Figure], tuple[page.LegendItem, ...]]:
     """Speeds against rates of turn, a dot for every half second; with sideways motion also velocities from above."""
     twists, _ = _twists(runs, robot)
     twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
     kinds = motion_kinds(twists, robot)
     left, right = turning(kinds, "left"), turning(kinds, "right")
-    groups = ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right))
+    groups = [each for each in ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right)) if each[1].any()]
     beside, above = [], []
     for item, chosen in groups:
         ahead, aside, rate = twists[chosen].T
@@ -311,14 +311,14 @@ def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> page.FigureGrid:
         beside.append(marks(item, 5, np.degrees(rate), speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
     rates = plot(*beside, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
     rates.update_xaxes(autorange="reversed").update_yaxes(rangemode="tozero")
-    figures = [page.Figure("Speeds and rates of turn", rates, "Speed in m/s against the rate of turn in °/s", 340)]
+    title = "Speeds and rates of turn, a dot for every half second"
+    figures = [page.Figure(title, rates, "Speed in m/s against the rate of turn in °/s", 340)]
     if any(name.startswith("sideways") for name in kinds):
         seen = plot(*above, x_title="to the left (m/s)", y_title="ahead (m/s)")
         seen.update_layout(xaxis={"autorange": "reversed", "scaleanchor": "y"}, yaxis={"scaleratio": 1})
         title = "Velocities, seen from above"
         figures.append(page.Figure(title, seen, "Velocity ahead against velocity to the left, m/s", 340))
-    items, words = tuple(item for item, _ in groups), "A dot is half a second, by the design values."
-    return page.FigureGrid(tuple(figures), items, 2, words, "motions-driven")
+    return figures, tuple(item for item, _ in groups)
 
 
 def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Document:
@@ -326,15 +326,20 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Docume
     training = dataset.split("train") or dataset.trajectories
     motions = driven_motions(training, dataset.robot)
     identified = inspection.identifiability
+    figures, items = motion_figures(training, dataset.robot)
+    picture = path_overview(dataset)
+    if len(picture.figures) == 1:  # beside the paths there is room for the speeds
+        both, words = (*picture.figures, figures.pop(0)), f"{picture.caption} Speeds by the design values."
+        picture = page.FigureGrid(both, (*picture.legend, *items), 2, words, picture.name)
     return page.Document(
         title=f"What is in {dataset.name}",
         subtitle=dataset.description,
         sections=(
-            _answer(dataset, inspection, motions),
+            _answer(inspection, motions, picture),
             page.Section(
                 "motions",
                 "Motions driven",
-                (motion_figures(training, dataset.robot), motion_table(motions)),
+                (*((page.FigureGrid(tuple(figures), items),) if figures else ()), motion_table(motions)),
                 about="By the training runs, from which a calibration is fitted.",
             ),
             page.Section(
@@ -359,7 +364,7 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Docume
     )
 
 
-def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion]) -> page.Section:
+def _answer(inspection: Inspection, motions: list[DrivenMotion], picture: page.FigureGrid) -> page.Section:
     splits, open_ones = inspection.splits, inspection.identifiability.sentences
     missing = missing_in_words(motions)
     lacks = f"Not driven to train: {missing}." if missing else "Every kind of motion was driven to train."
@@ -384,7 +389,7 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
     return page.answer_section(
         f"{plural(inspection.trajectories, 'run')} of {inspection.robot}. {lacks} {told}",
         tiles,
-        path_overview(dataset),
+        picture,
         page.Callout("Findings", inspection.findings, "warning" if open_ones else "plain"),
         page.Callout("Warnings on reading the data", inspection.warnings, "warning"),
     )

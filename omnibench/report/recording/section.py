@@ -294,7 +294,8 @@ def contents_table(dataset: Dataset) -> blocks.Table:
     device = ""
     if scans is not None:
         turn = np.degrees(abs(scans.scanner.angle_increment) * (scans.scanner.rays - 1))
-        device = (
+        device = f"{scans.scanner.name}: " if scans.scanner.name else ""
+        device += (
             f"{count(scans.scanner.rays)} ranges over {significant(float(turn), 3)}°, to {scans.scanner.range_max:g} m"
         )
     times = [] if scans is None else [scans.times(run) for run in scanned]
