@@ -26,12 +26,14 @@ from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration, left_out
 from omnibench.robot.kinematics import Array, relative_deviations
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
 
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
 _ROWS = (("x", "m/rad"), ("y", "m/rad"), ("w", "rad/rad"))
 _COLUMNS = 3  # drive signals whose elements stand side by side in 80 columns; of more, each has a row
-_SCREEN = 12  # rows of parameters and matrix that a screen of 25 lines holds beside all else
+_SCREEN, _WIDTH = 25, 80  # lines and columns of a terminal that hold the answer
+_ENDING = (96 * ".", "COMMAND")  # as long as the sentence that a command ends with
 _TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
 _FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
 _TURNS = 0.35  # rad: a run that turns less in all is straight; chosen
@@ -59,6 +61,7 @@ class CalibrationResult(Result):
         origin = self.calibration.provenance
         self.verdict = verdict or (None if origin is None else origin.held_out)
         self.dataset, self.file, self.sources, self.again = dataset, file, sources, again
+        self.parameters = _physical(self.calibration)
         fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
         name, robot = self.calibration.name, self.calibration.robot.name
         self.title = f"{type(shown).__name__} {name!r} of robot {robot}{fitted}"
@@ -87,14 +90,13 @@ class CalibrationResult(Result):
         return next_step(self.calibration, self.verdict, self.file, self.sources)
 
     def tables(self) -> Sequence[page.Table]:
-        known = self.calibration.physical_parameters
-        first = [parameter_table(self.calibration, self._heading)] if known else [self._elements()]
-        rows = len(self.calibration.matrix[0])
-        rows = len(_ROWS) if rows <= _COLUMNS else rows
-        return [
-            *first,
-            *([self.matrix_table()] if known and len(first[0].rows) + rows + 2 * len(self.warnings) <= _SCREEN else []),
-        ]
+        """Parameters, and the matrix as far as a screen holds both."""
+        if not self.parameters:
+            return [self._elements()]
+        tables = [parameter_table(self.calibration, self._heading), self.matrix_table()]
+        lines = [*self.warnings, *(remark.text for remark in self._beside), *_ENDING]
+        height = sum(-(-len(line) // _WIDTH) for line in lines) + sum(2 + len(table.rows) for table in tables)
+        return tables if height <= _SCREEN else tables[:1]
 
     @property
     def _heading(self) -> str:
@@ -102,10 +104,15 @@ class CalibrationResult(Result):
         return f"{self.calibration.name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
 
     def remarks(self) -> Sequence[Remark]:
-        lines, run = [], self.run
-        if len(self.tables()) == 1 and self.calibration.physical_parameters:
-            size = f"3 x {len(self.calibration.matrix[0])}"
-            lines.append(f"matrix ({size}): not on this screen; --json shows it, -o writes it")
+        if len(self.tables()) == 2 or not self.parameters:
+            return self._beside
+        size = f"3 x {len(self.calibration.matrix[0])}"
+        return [Remark(f"matrix ({size}): not on this screen; --json shows it, -o writes it"), *self._beside]
+
+    @property
+    def _beside(self) -> list[Remark]:
+        """What is said below the tables, whether or not the matrix is among them."""
+        lines, run = list[str](), self.run
         if run is not None and run.uncertainty is not None:
             lines.append(f"95 % intervals: {run.uncertainty.source}")
         if run is not None and run.result.outcome != "converged":
@@ -166,7 +173,7 @@ class CalibrationResult(Result):
 
     def _parameters(self) -> pl.DataFrame:
         schema = {"name": pl.String, "design": pl.Float64, "value": pl.Float64, "unit": pl.String}
-        rows = [each.model_dump() for each in self.calibration.physical_parameters.values()]
+        rows = [each.model_dump() for each in self.parameters.values()]
         return pl.DataFrame(rows, {**schema, "low": pl.Float64, "high": pl.Float64})
 
     def _matrix(self) -> pl.DataFrame:
@@ -342,6 +349,14 @@ def verdict_remarks(verdict: HeldOutVerdict | None) -> list[Remark]:
     return [Remark(verdict.sentence, _TONES[verdict.verdict]), *([Remark(detail)] if detail else [])]
 
 
+def _physical(calibration: Calibration) -> Mapping[str, PhysicalParameter]:
+    """The physical parameters; none where no wheels near the design have the matrix."""
+    try:
+        return calibration.physical_parameters
+    except DataError:
+        return {}
+
+
 def _models(calibration: Calibration, dataset: Dataset) -> Models:
     """The design and the calibration."""
     design = OdometryModel.of_design(dataset.robot, calibration.integration)
@@ -369,7 +384,7 @@ def calibration_document(
         interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
         tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
     sections = []
-    if calibration.physical_parameters:
+    if _physical(calibration):
         blocks: tuple[page.Block, ...] = (parameter_table(calibration),)
         if (figure := _changes(calibration)) is not None:
             blocks = (page.FigureGrid((figure,), (_CALIBRATED,), 1, "", "parameters"), *blocks)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     from pydantic import BaseModel
 
-ROWS = 8  # of a table at a prompt and in a notebook
+_ROWS = 8  # of a table at a prompt and in a notebook
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class Result:
 def frame_table(frame: pl.DataFrame) -> Table:
     """The head of a data frame as a table."""
     columns = tuple(Column(name, numeric=dtype.is_numeric()) for name, dtype in frame.schema.items())
-    rows = tuple(Row.of(*map(_cell, row)) for row in frame.head(ROWS).iter_rows())
-    return Table("", columns, rows, f"the first {ROWS} of {len(frame):,} rows" if len(frame) > ROWS else "")
+    rows = tuple(Row.of(*map(_cell, row)) for row in frame.head(_ROWS).iter_rows())
+    return Table("", columns, rows, f"the first {_ROWS} of {len(frame):,} rows" if len(frame) > _ROWS else "")
 
 
 def _cell(value: Any) -> str:

@@ -12,7 +12,7 @@ from rich.table import Table as Lines
 from rich.text import Text
 
 from omnibench.report.blocks import Cell, Paragraph, Table
-from omnibench.report.result import ROWS, Remark, Result, frame_table
+from omnibench.report.result import Remark, Result, frame_table
 from omnibench.views import screenful
 
 _WIDTH: Final = 116  # columns of a text at a prompt
@@ -114,7 +114,7 @@ def as_text(result: Result) -> str:
     """A result at a Python prompt: at most twenty lines of at most 120 characters."""
     console = Console(file=StringIO(), width=_WIDTH, markup=False, emoji=False, highlight=False, color_system=None)
     for table in result.tables():
-        console.print(render_table(_head(table), console.width))
+        console.print(render_table(table, console.width))
     below = [remark.text for remark in result.remarks()]
     tables: str = console.file.getvalue()  # type: ignore[attr-defined]
     lines = [result.sentence(), *tables.splitlines(), *below]
@@ -128,8 +128,4 @@ def as_html(result: Result) -> str:
     texts = [result.title, result.sentence(), *(remark.text for remark in result.remarks())]
     first, *others = [Paragraph(text) for text in texts if text]
     tables = result.tables() or [frame_table(make()) for make in list(result.frames().values())[:1]]
-    return fragment([Paragraph(first.text, "lead"), *map(_head, tables), *others])
-
-
-def _head(table: Table) -> Table:
-    return Table(table.caption, table.columns, table.rows[:ROWS], table.note)
+    return fragment([Paragraph(first.text, "lead"), *tables, *others])

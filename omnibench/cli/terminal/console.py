@@ -91,8 +91,13 @@ def show(result: Result, as_json: bool = False) -> None:
     from omnibench.report.terminal import print_result
 
     print_result(make_console(), result)
+    return print_next(result)
+
+
+def print_next(result: Result) -> None:
+    """Print what came out and what to do next."""
     step = result.next_step()
-    return print_ending(step.outcome, step.then, *step.command)
+    print_ending(step.outcome, step.then, *step.command)
 
 
 def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:
