@@ -181,7 +181,7 @@ def calibrate(
     if output is not None:
         write_text(output, to_yaml(run.calibration))
     again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
-    result = CalibrationResult(run, recordings, file=output, sources=dataset, again=again)
+    result = CalibrationResult(run, recordings, file=output, sources=dataset, again=again, box=chosen.box)
     page.write(result.document, announced=True)
     show(result, as_json)
 

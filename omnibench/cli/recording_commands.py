@@ -348,14 +348,10 @@ def slam(
     if output is None and not page.asked and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
-        result = ReferencePosesResult(request.run(watch, table_format), output)
+        result = ReferencePosesResult(request.run(watch, table_format), output, page.report)
         if page.asked:
             watch(Progress("writing the report"))
         page.write(result.document)
-    if not as_json:
-        for what, file in (("report", page.report), (plural(result.result.summary.runs, "trajectory"), output)):
-            if file is not None:
-                typer.echo(f"{what}: {file}")
     show(result, as_json)
 
 

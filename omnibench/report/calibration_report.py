@@ -44,7 +44,7 @@ class CalibrationResult(Result):
     """A calibration or a run of ``calibrate``.
 
     file: where it was written, None if nowhere. sources: the data sets as they were typed. dataset: for the page.
-    verdict: by held-out runs, by default that of its file. again: words that write it.
+    verdict: by held-out runs, by default that of its file. again: words that write it. box: that was searched.
     """
 
     def __init__(
@@ -55,7 +55,9 @@ class CalibrationResult(Result):
         file: Path | None = None,
         sources: Sequence[Path] = (),
         again: Sequence[str] = (),
+        box: object = None,
     ) -> None:
+        self.box = "" if box is None else f" {box!r}"
         self.run = shown if isinstance(shown, CalibrationRun) else None
         self.calibration = shown.calibration if isinstance(shown, CalibrationRun) else shown
         origin = self.calibration.provenance
@@ -73,9 +75,9 @@ class CalibrationResult(Result):
             return []
         found = [*(self.dataset.warnings if self.dataset else ()), *self.run.warnings]
         if bounds := ", ".join(self.run.result.at_bounds):
-            found.append(f"on a bound of the box that was searched: {bounds}; a wider box may fit better")
+            found.append(f"on a bound of the box{self.box}: {bounds}; a wider box may fit better")
         if untouched := ", ".join(self.run.untouched):
-            found.append(f"not fitted, kept at the start value by the box or the cost: {untouched}")
+            found.append(f"not fitted, kept at the start value by the box{self.box} or the cost: {untouched}")
         return found
 
     def sentence(self) -> str:
@@ -159,7 +161,7 @@ class CalibrationResult(Result):
         shares = relative_deviations(self.calibration.matrix_array, design).ravel()
         for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
             low, high = row.get("low"), row.get("high")
-            interval = NOTHING if low is None or low == high else f"{low:+.7f} to {high:+.7f}"
+            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
             values = (f"{row[name]:+.7f}" for name in ("design", "value"))
             rows.append(
                 page.Row.of(f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(float(share)), interval)

@@ -21,7 +21,7 @@ from omnibench.report import blocks
 from omnibench.report.figures import is_placed, joined, line
 from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
 from omnibench.report.recording import recording_figures
-from omnibench.report.result import NextStep, Result
+from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import INK, PALETTE, plot
 from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
@@ -161,16 +161,20 @@ def _rounded(values: Array, decimals: int = 3) -> Any:
 class ReferencePosesResult(Result):
     """Reference poses by SLAM: how certain they are, and how far from recorded and from true ones.
 
-    result: of ``slam``. poses: the data set that was written.
+    result: of ``slam``. poses, report: the data set and the page that were written.
     """
 
-    def __init__(self, result: SlamResult, poses: Path | None = None) -> None:
-        self.result, self.poses = result, poses
+    def __init__(self, result: SlamResult, poses: Path | None = None, report: Path | None = None) -> None:
+        self.result, self.poses, self.report = result, poses, report
         self.warnings = result.summary.warnings
 
     def tables(self) -> Sequence[blocks.Table]:
         summary = self.result.summary
         return [summary_table(summary), *([error_table(summary.accuracy)] if summary.accuracy is not None else [])]
+
+    def remarks(self) -> Sequence[Remark]:
+        written = {"report": self.report, plural(self.result.summary.runs, "trajectory"): self.poses}
+        return [Remark(f"{what}: {file}") for what, file in written.items() if file is not None]
 
     def next_step(self) -> NextStep:
         poses = f"{plural(self.result.summary.scans, 'scan')} gave poses"
