@@ -16,7 +16,7 @@ from omnibench.design.candidates import DesignConfig, candidates_of_config, cand
 from omnibench.design.design import Design, design_experiment
 from omnibench.design.report import DesignResult, design_document
 from omnibench.report.render import write_document
-from omnibench.report.terminal import print_result
+from omnibench.report.terminal import print_result, print_table
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
@@ -69,7 +69,8 @@ def test_report_and_terminal_read_as_before(design: Design, report: Page, snapsh
     assert report.words() == snapshot
     told = printed(design)
     assert NUMBER.sub("#", " ".join(told.split())) == snapshot
-    assert max(map(len, told.splitlines())) <= 100
+    for table in DesignResult(design).tables():
+        assert max(map(len, on_terminal(print_table, table, width=100).splitlines())) <= 100
     assert "…" not in told
 
 
