@@ -143,8 +143,8 @@ def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
 # How much one figure draws (chosen: more cannot be told apart on a screen).
 _POINTS = 2500  # scan points
 _SCANS = 120  # scans of a run
-_RUNS = 300  # runs
-_PATH = 200  # poses of a path
+_RUNS = 120  # runs
+_PATH = 100  # poses of a path
 
 
 def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> FigureGrid:
@@ -196,7 +196,7 @@ def _map(traces: Sequence[go.Scatter]) -> go.Figure:
 
 
 _MEAN_OVER = 0.1  # s; also in the legends
-_DRAWN = 1000  # means drawn at most (chosen: as fine as a screen shows)
+_DRAWN = 600  # means drawn at most (chosen: as fine as a screen shows)
 _ROW = 130  # px, height of a wheel's row
 _GAP = 0.06  # space between rows, as a share of the plot
 

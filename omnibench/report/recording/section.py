@@ -30,7 +30,7 @@ from omnibench.words import kind_of_data, plural
 
 _FRAMES = 200  # frames drawn of a run (chosen: steps of the slider that can be told apart)
 _MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
-_SCANS = 40  # scans drawn of a run (chosen: keeps the file small)
+_SCANS = 30  # scans drawn of a run (chosen: keeps the file small)
 _RAYS = 180  # rays drawn of a scan (chosen: keeps the file small)
 _MARGIN = 0.4  # m around everything that is drawn
 _SEEN = blocks.LegendItem("scan", "this moment's scan", "#d97706")
