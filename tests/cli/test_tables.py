@@ -36,6 +36,7 @@ from omnibench.report.recording.inspection_report import InspectionResult
 from omnibench.report.render import render
 from omnibench.report.result import Result
 from omnibench.report.terminal import print_result, print_table
+from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.testing.synthetic import PERIOD, synthetic_trajectories
 
@@ -262,6 +263,16 @@ def test_without_a_reading_each_element_has_a_row_with_its_interval() -> None:
     lines = on_terminal(print_result, CalibrationResult(replace(run, calibration=bare))).splitlines()
     low, high = (run.to_frame()[end][0] for end in ("low", "high"))
     assert f"{low:+.7f} to {high:+.7f}" in lines[2]
+
+
+@pytest.mark.parametrize(("terminal", "colour"), [(True, "\x1b[1;32mheld out"), (False, "held out")])
+def test_a_verdict_has_its_colour_on_a_terminal_and_none_in_a_pipe(terminal: bool, colour: str) -> None:
+    runs = recorded(DIFFERENTIAL, 1.02 * DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
+    better = HeldOutVerdict(verdict="better", sentence="held out: better than the design", detail="")
+    console = Console(file=StringIO(), force_terminal=terminal, color_system="standard" if terminal else None)
+    print_result(console, CalibrationResult(run, verdict=better, file=Path("c.yaml")))
+    assert f"\n{colour}" in console.file.getvalue()
 
 
 ALWAYS, NEVER = 0.0, 1e9  # s between two lines of a task that goes on

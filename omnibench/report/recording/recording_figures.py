@@ -143,7 +143,7 @@ def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
 # How much one figure draws (chosen: more cannot be told apart on a screen).
 _POINTS = 2500  # scan points
 _SCANS = 120  # scans of a run
-_RUNS = 120  # runs
+_RUNS = 80  # runs
 _PATH = 100  # poses of a path
 
 

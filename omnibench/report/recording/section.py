@@ -326,7 +326,7 @@ def _every(times: Sequence[Array]) -> str:
     return f"{middle} ms" if low == high else f"{middle} ms ({low} to {high})"
 
 
-_RUNS = 100  # runs drawn as thin lines (chosen)
+_RUNS = 50  # runs drawn as thin lines (chosen)
 _BINS = 16  # bins of distance (chosen)
 _LEAST = 5  # poses; a bin with fewer shows no mean (chosen)
 _RUN = blocks.LegendItem("run", "a run", "#c3c9d0")
