@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import cycle
 from operator import attrgetter
 from pathlib import Path
@@ -248,11 +249,6 @@ def precision_figures(design: Design) -> page.FigureGrid:
             f"All elements together, as a multiple of the baseline's ({baseline})",
             _curves(design, _RUNS, "runs", [_RELATIVE], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
-        ),
-        page.Figure(
-            "All elements together, against the time of driving",
-            _curves(design, _SECONDS, "time of driving (s)", [_RELATIVE], "standard deviation / baseline's"),
-            "Geometric mean of the standard deviations against the time of driving, on logarithmic scales",
         ),
         page.Figure(
             "Rows of the matrix: x solid, y dashed, heading dotted",
@@ -544,6 +540,8 @@ def design_document(design: Design) -> page.Document:
         ]
         equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(page.Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
+    curves = precision_figures(design)
+    left = curves.figures[1:] if len(design.sets) == 1 else curves.figures[:2]  # the first may be in the answer
     return page.Document(
         title=f"Which commands are worth driving: {design.name}",
         subtitle=design.description,
@@ -553,7 +551,7 @@ def design_document(design: Design) -> page.Document:
             page.Section(
                 "precision",
                 "Precision against runs",
-                (precision_figures(design), promise_table(design), equal_table(design)),
+                (replace(curves, figures=left), promise_table(design), equal_table(design)),
                 about="How well the matrix is known after so many runs, beside the baseline.",
                 folded=True,
             ),
@@ -598,7 +596,11 @@ def _answer(design: Design) -> page.Section:
         title = "What to drive" + " of {}" * (len(design.sets) > 1)
         plans = [page.Callout(title.format(of_set.name), plan_in_words(design, of_set)) for of_set in design.sets]
     notes = page.Callout("Before you rely on it", design.notes)
-    return page.answer_section(headline(design), tiles, path_figures(design), *plans, notes)
+    picture = path_figures(design)
+    if len(picture.figures) == 1:  # beside the paths there is room for what they give
+        both = (*picture.figures, precision_figures(design).figures[0])
+        picture = replace(picture, figures=both, columns=2)
+    return page.answer_section(headline(design), tiles, picture, *plans, notes)
 
 
 def _basis(design: Design) -> tuple[page.Block, ...]:
