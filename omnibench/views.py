@@ -1,14 +1,13 @@
 """Short texts, data frames and figures of public objects, for a Python prompt and for notebooks.
 
-What an object shows is said in the room ``notebook``, which stands above all others: here the object's class names the
-view, which is imported when it is first asked for.
+What an object shows is said by its result in the rooms above (``omnibench.report.result``): here the object's class
+names that, which is imported when it is first asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from html import escape
 from importlib import import_module
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -19,40 +18,20 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     import polars as pl
 
-# Module and class of the room ``notebook``, by the class that is shown: a plug-in's may be called the same.
-_VIEWS = {
-    "omnibench.robot.calibration.Calibration": ("calibration_view", "CalibrationView"),
-    "omnibench.fit.calibrate.CalibrationRun": ("calibration_view", "CalibrationRunView"),
-    "omnibench.compare.result.ComparisonResult": ("comparison_view", "ComparisonView"),
-    "omnibench.data.dataset.Dataset": ("recording_view", "DatasetView"),
-    "omnibench.discover.result.Discovery": ("discovery_view", "DiscoveryView"),
-    "omnibench.fit.evaluate.Evaluation": ("calibration_view", "EvaluationView"),
-    "omnibench.robot.kinematics.Robot": ("recording_view", "RobotView"),
-    "omnibench.data.dataset.Trajectory": ("recording_view", "TrajectoryView"),
+# Module and class of the result, by the class that is shown: a plug-in's may be called the same.
+_RESULTS = {
+    "omnibench.robot.calibration.Calibration": ("report.calibration_report", "CalibrationResult"),
+    "omnibench.fit.calibrate.CalibrationRun": ("report.calibration_report", "CalibrationResult"),
+    "omnibench.compare.result.ComparisonResult": ("compare.report.comparison_view", "ComparisonView"),
+    "omnibench.data.dataset.Dataset": ("report.recording.data_results", "DatasetResult"),
+    "omnibench.discover.result.Discovery": ("discover.report.discovery_result", "DiscoveryResult"),
+    "omnibench.fit.evaluate.Evaluation": ("report.calibration_report", "EvaluationResult"),
+    "omnibench.robot.kinematics.Robot": ("report.recording.data_results", "RobotResult"),
+    "omnibench.data.dataset.Trajectory": ("report.recording.data_results", "TrajectoryResult"),
 }
 _LINES = 20  # of a text, at most: a screenful with what was typed
 _WIDTH = 120  # characters of a line of such a text
 _VALUE = 60  # characters of a field's value in it
-_ROWS = 8  # rows of the table that a notebook shows below the text
-
-
-class View:
-    """An object as it is shown. Subclasses say its text, its tables and its figure."""
-
-    def __init__(self, shown: Any) -> None:
-        self.shown = shown
-
-    def lines(self) -> Iterable[str]:
-        """The text: a first line that says what it is, and lines below."""
-        raise NotImplementedError
-
-    def tables(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        """Data frames by name; the first is the one that is shown where none is named."""
-        raise NotImplementedError
-
-    def figure(self, *arguments: Any, **options: Any) -> go.Figure:
-        """The figure."""
-        raise NotImplementedError
 
 
 class Brief:
@@ -67,17 +46,14 @@ class Shown:
     """A mixin for results: a short text, tables as Polars data frames and a Plotly figure."""
 
     def __repr__(self) -> str:
-        return "\n".join(screenful(_view(self).lines()))
+        return str(_of_reports("as_text")(_result(self)))
 
     def __str__(self) -> str:
         return repr(self)
 
     def _repr_html_(self) -> str:
-        """The text and the head of the first table, for notebooks."""
-        first, *others = map(escape, screenful(_view(self).lines()))
-        below = "".join(f"<br>{line}" for line in others)
-        table = next(iter(_view(self).tables().values()))()
-        return f"<div><b>{first}</b>{below}</div>{table.head(_ROWS)._repr_html_()}"
+        """Title, sentence and tables, for notebooks."""
+        return str(_of_reports("as_html")(_result(self)))
 
     @overload
     def to_frame(self, table: str | None = None, *, pandas: Literal[False] = False) -> pl.DataFrame: ...
@@ -91,7 +67,7 @@ class Shown:
         comparison: statistics, runs, errors, history. A discovery: effects, residuals. UnknownNameError lists those
         that there are.
         """
-        tables = _view(self).tables()
+        tables = _result(self).frames()
         name = next(iter(tables)) if table is None else table
         require_choice("table", name, tables)
         return as_pandas(tables[name]()) if pandas else tables[name]()
@@ -105,11 +81,11 @@ class Shown:
         comparison: the cost of every entry (``dataset=`` names one of several). A discovery: the errors before and
         after.
         """
-        view = _view(self)
-        parameters = signature(view.figure).parameters
+        result = _result(self)
+        parameters = signature(result.figure).parameters
         for option in sorted(options):
             require_choice("option of plot", option, parameters)
-        return view.figure(**options)
+        return result.figure(**options)
 
 
 def as_pandas(frame: pl.DataFrame) -> Any:
@@ -153,9 +129,13 @@ def _shortened(value: Any) -> str:
     return words if len(words) <= _VALUE else f"<{type(value).__name__}>"
 
 
-def _view(shown: Shown) -> View:
-    """The view of an object, by its class."""
+def _result(shown: Shown) -> Any:
+    """The result of an object, by its class."""
     kinds = (f"{kind.__module__}.{kind.__qualname__}" for kind in type(shown).__mro__)
-    module, name = next(_VIEWS[kind] for kind in kinds if kind in _VIEWS)
-    view: View = getattr(import_module(f"omnibench.notebook.{module}"), name)(shown)
-    return view
+    module, name = next(_RESULTS[kind] for kind in kinds if kind in _RESULTS)
+    return getattr(import_module(f"omnibench.{module}"), name)(shown)
+
+
+def _of_reports(name: str) -> Any:
+    """A renderer of the room above."""
+    return getattr(import_module("omnibench.report.terminal"), name)

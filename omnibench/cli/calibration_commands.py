@@ -11,7 +11,7 @@ import typer
 import omnibench
 from omnibench.cli import options as shared
 from omnibench.cli.options import argument, flag, names_in, option, options_of, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_verdict, warn
+from omnibench.cli.terminal.console import make_console, print_ending, show, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import refuse_existing, write_text
@@ -58,6 +58,7 @@ def compare(
     plugins: list[Path] | None = option(
         "Folder of plug-ins besides the config's; may be repeated.", "--plugins", metavar="DIR"
     ),
+    as_json: bool = shared.JSON,
 ) -> None:
     """Run calibrators on equal terms, score them, write a report.
 
@@ -67,7 +68,7 @@ def compare(
     """
     from platformdirs import user_cache_path
 
-    from omnibench.cli.terminal.comparison_tables import print_comparison_ending, print_result
+    from omnibench.compare.report.comparison_view import ComparisonView
     from omnibench.compare.report.document import comparison_document
     from omnibench.compare.report.searches import write_traces
     from omnibench.compare.report.view import views
@@ -90,12 +91,8 @@ def compare(
         if figures is not None:
             watch(Progress("drawing the figures"))
             shared.write_asked_figures(comparison_document(result), figures)
-    warn(result.warnings)
-    print_result(make_console(), result, everything=everything)
-    for name, entry in result.held_out.items():
-        print_verdict(entry.verdict, f"{name}, {entry.label}: ", result.sessions.get(name, ()))
-    typer.echo(f"report: {result.output / 'report.html'}")
-    if not print_comparison_ending(result):
+    show(ComparisonView(result, everything=everything), as_json)
+    if result.nothing_answered or result.broken:
         raise typer.Exit(1)
 
 
@@ -172,10 +169,9 @@ def calibrate(
 
     The fit uses the training split of the data set, and never its validation split.
     """
-    from omnibench.cli.terminal.calibration_tables import print_calibration, print_verdict_ending
     from omnibench.config import parse_settings, to_yaml
     from omnibench.registry import calibrators, costs
-    from omnibench.report.calibration_report import calibration_document
+    from omnibench.report.calibration_report import CalibrationResult
 
     shared.load_given_plugins(plugins)
     chosen = asked.model_copy(update={"options": parse_settings(settings)})
@@ -188,37 +184,12 @@ def calibrate(
     with redirect_stdout(sys.stderr), ProgressDisplay() as watch, jobs.opened(watch) as backend:
         recordings = omnibench.load_dataset(dataset)
         run = omnibench.calibrate(recordings, chosen, watch=watch, backend=backend)
-    calibration, result = run.calibration, run.result
     if output is not None:
-        write_text(output, to_yaml(calibration))
-    warnings = [*recordings.warnings, *run.warnings]
-    if result.at_bounds:
-        bounds = f"on a bound of the box {chosen.box!r}: {', '.join(result.at_bounds)}"
-        warnings.append(f"{bounds}; a wider box may fit better")
-    if run.untouched:
-        held = f"kept at the start value by the box {chosen.box!r} or the cost: {', '.join(run.untouched)}"
-        warnings.append(f"not fitted, {held}")
-    warn(warnings)
-    assert calibration.provenance is not None  # a fit has one, with its verdict
-    assert calibration.provenance.held_out is not None
-    verdict = calibration.provenance.held_out
-    page.write(lambda: calibration_document(calibration, recordings, verdict, run.warnings), announced=True)
-    if as_json:
-        return print_json(calibration)
-    file = [] if output is None else [f"calibration: {output}"]
-    # The last sentence takes a line that is longer than many terminals are wide, and the command one more.
-    printed = [*warnings, *file, verdict.sentence, 96 * ".", "COMMAND"]
-    room = print_calibration(make_console(), run, printed, verdict.detail)
-    for line in file:
-        typer.echo(line)
-    print_verdict(verdict if room else verdict.model_copy(update={"detail": ""}))
-    if result.at_bounds and output is not None:
-        what = f"{output} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
-        return print_ending(what, "see what is", "omnibench", "check", *dataset)
-    if output is None:
-        again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
-        return print_ending("the calibration above is written nowhere", "write it to a file", *again)
-    return print_verdict_ending(verdict, calibration, output, dataset)
+        write_text(output, to_yaml(run.calibration))
+    again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
+    result = CalibrationResult(run, recordings, file=output, sources=dataset, again=again, box=chosen.box)
+    page.write(result.document, announced=True)
+    show(result, as_json)
 
 
 @calibration_app.command()
@@ -245,9 +216,8 @@ def evaluate(
     On each split: the cost, and the errors of the final pose, beside those of the robot's design values. On each path:
     the expected error at its end and the region that holds 95 % of errors. Without DATASET the paths alone.
     """
-    from omnibench.cli.terminal.calibration_tables import print_evaluation, print_path_errors, print_verdict_ending
     from omnibench.fit.path_errors import predicted_errors, regions_lack
-    from omnibench.report.calibration_report import calibration_document
+    from omnibench.report.calibration_report import EvaluationResult
 
     shared.load_given_plugins(plugins)
     page.refuse(force=force)
@@ -261,21 +231,9 @@ def evaluate(
     warnings = [lack] if (lack := regions_lack(evaluated)) else []
     if recordings is not None and evaluation is not None:
         warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
-    warn(warnings)
-    if recordings is not None and evaluation is not None:
-        of_data = recordings, evaluation.held_out, evaluation.warnings
-        page.write(lambda: calibration_document(evaluated, *of_data), announced=True)
-    if as_json:
-        document = {} if evaluation is None else evaluation.model_dump()
-        return print_json(document | {"paths": [error.model_dump() for error in predicted], "warnings": warnings})
-    if evaluation is not None:
-        print_evaluation(make_console(), evaluation)
-    print_path_errors(make_console(), predicted, evaluated)
-    if evaluation is None or dataset is None:
-        other = ("omnibench", "evaluate", str(calibration), "DATASET")
-        return print_ending("these errors are predicted", "see those on recordings", *other)
-    print_verdict(evaluation.held_out, sessions=evaluation.sessions)
-    return print_verdict_ending(evaluation.held_out, evaluated, calibration, dataset)
+    result = EvaluationResult(evaluation, evaluated, predicted, recordings, calibration, dataset or (), warnings)
+    page.write(result.document, announced=True)
+    show(result, as_json)
 
 
 @calibration_app.command()
@@ -297,7 +255,7 @@ def certify(
 
     Gives a lower bound on the cost of every matrix in the box, on the training split, whatever the optimiser.
     """
-    from omnibench.cli.terminal.calibration_tables import print_certificate, print_certificate_ending
+    from omnibench.report.certificate import CertificateResult
 
     shared.load_given_plugins(plugins)
     with ProgressDisplay() as watch, jobs.opened(watch, "omnibench.fit.certify") as backend:
@@ -306,13 +264,7 @@ def certify(
             omnibench.read_calibration(calibration), recordings, box=box, gap=gap, seconds=seconds, parts=parts,
             watch=watch, backend=backend,
         )  # fmt: skip
-    warn(recordings.warnings)
-    if not certified.inside:
-        warn([f"the calibration is outside the box {certified.certificate.box!r}; the bound is for matrices inside it"])
-    if as_json:
-        return print_json(certified.certificate.model_dump(exclude_none=True))
-    print_certificate(make_console(), certified)
-    return print_certificate_ending(certified, calibration, dataset)
+    show(CertificateResult(certified, calibration, dataset), as_json)
 
 
 @calibration_app.command()
@@ -365,11 +317,10 @@ def discover(
     Shows where odometry and reference disagree, names the effect that explains it, adds it to the calibration, and
     tells how much smaller the error becomes on runs that were held out.
     """
-    from omnibench.cli.terminal.discovery_summary import print_discovery
     from omnibench.config import to_yaml
     from omnibench.discover.output import check_output, write_discovery
     from omnibench.discover.report.discovery_report import discovery_report
-    from omnibench.discover.result import discovery_document
+    from omnibench.discover.report.discovery_result import DiscoveryResult
     from omnibench.registry import effects
 
     shared.refuse_figures_without_browser(figures)
@@ -386,7 +337,4 @@ def discover(
         folder = write_discovery(discovery, options, output, force=force)
         if figures is not None:
             shared.write_asked_figures(discovery_report(discovery, to_yaml(options)), figures)
-    warn(recordings.warnings)
-    if as_json:
-        return print_json(discovery_document(discovery, folder))
-    return print_discovery(make_console(), discovery, folder)
+    show(DiscoveryResult(discovery, folder), as_json)

@@ -127,9 +127,9 @@ def list_(
 
     Those of one kind each with where it comes from: built in, a plug-in's file, or an installed package.
     """
-    from omnibench.cli.terminal.tables import print_table
     from omnibench.registry import REGISTRIES, Entry
     from omnibench.report.blocks import Column, Row, Table
+    from omnibench.report.terminal import print_table
 
     failures = shared.load_given_plugins(plugins)
     entries = {f"{registry.kind}s": registry.entries() for registry in REGISTRIES}

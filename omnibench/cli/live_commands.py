@@ -10,7 +10,7 @@ import typer
 
 from omnibench.cli import options as shared
 from omnibench.cli.options import argument, flag, option, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_next, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
 from omnibench.files import refuse_existing, remove
@@ -85,11 +85,12 @@ def _replay_to_node(
     config: "LiveConfig", dataset: Path | None, speed: str | None, file: Path, seconds: float | None
 ) -> None:
     """Play a recording to a node of this process, and show the errors of its odometry."""
-    from omnibench.cli.terminal.live_tables import node_log, print_demonstration
+    from omnibench.cli.terminal.live_tables import DemonstrationResult, node_log
     from omnibench.config import validate
     from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
     from omnibench.live.replay.demonstration import demonstrate
     from omnibench.live.stopping import stop_on_signals
+    from omnibench.report.terminal import print_result
 
     source = dataset or config.replay.dataset
     if source is None:
@@ -101,12 +102,11 @@ def _replay_to_node(
         recording = load_recording(source, watch=watch)
     with ProgressDisplay() as watch, node_log(watch.console, warnings_only=True), stop_on_signals() as stop:
         demonstration = demonstrate(config, recording, stop, watch, math.inf if seconds is None else seconds)
-    print_demonstration(make_console(), demonstration)
+    result = DemonstrationResult(demonstration, file)
+    print_result(make_console(), result)
     if demonstration.report.interrupted:
         raise typer.Exit(130)
-    print_ending(
-        "the node computed what the batch odometry computes", "run it for the robot", "omnibench", "live", file
-    )
+    print_next(result)
 
 
 @live_app.command()
@@ -128,13 +128,14 @@ def replay(
 
     An omnibench node acknowledges what it takes, and is waited for; other programs do not, which is said.
     """
-    from omnibench.cli.terminal.live_tables import print_counted, print_played
+    from omnibench.cli.terminal.live_tables import PlayedResult
     from omnibench.config import parse_settings, validate
     from omnibench.live.network.presence import checked_robot
     from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_recording, load_recording
     from omnibench.live.replay.replay_player import Player
     from omnibench.live.stopping import stop_on_signals
     from omnibench.live.wire.topics import GraphNode
+    from omnibench.report.terminal import print_result
     from omnibench.robot.calibration import read_calibration
 
     checked_robot(robot)
@@ -148,12 +149,11 @@ def replay(
         player = Player(GraphNode(session, keys, "replay"), robot, drive, chosen, noise=noise)
         with ProgressDisplay() as watch:
             report = player.play(stop, watch, seconds=math.inf if seconds is None else seconds)
-    print_played(make_console(), report, recording.dataset.simulated)
-    print_counted(make_console(), report)
+    result = PlayedResult(report, recording.dataset.simulated, robot)
+    print_result(make_console(), result)
     if report.interrupted:
         raise typer.Exit(130)
-    heard = "all was taken by the node" if report.taken is not None else "no omnibench node said that it took anything"
-    print_ending(f"the recording was played, and {heard}", "listen while it plays", "omnibench", "listen", robot)
+    print_next(result)
 
 
 @live_app.command()

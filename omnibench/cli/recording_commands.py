@@ -1,5 +1,6 @@
 """``import``, ``fetch``, ``check``, ``inspect``, ``design``, ``slam`` and ``simulate``: recordings, old and new."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,7 +11,7 @@ from typer.core import TyperCommand
 import omnibench
 from omnibench.cli import options as shared
 from omnibench.cli.options import IMPORTER_NAMES, argument, flag, names_in, option, options_of, output_option
-from omnibench.cli.terminal.console import make_console, print_ending, print_json, print_names, say, warn
+from omnibench.cli.terminal.console import make_console, print_ending, print_names, say, show, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError, DataError
 from omnibench.files import refuse_existing, resolved, write_text
@@ -77,7 +78,6 @@ def import_(
     robot), rosbag, dataset (a data set again, with other options), table1, optiodom and plug-ins. Recordings with laser
     scans but without reference poses get these by SLAM.
     """
-    from omnibench.cli.terminal.recording_tables import print_import_ending
     from omnibench.config import parse_settings
     from omnibench.data.dataset import Imported
     from omnibench.data.finding import UNITS
@@ -143,7 +143,14 @@ def import_(
     if report is not None:
         make_console(error=True).print(f"check: {report.sentence}.", soft_wrap=True)
     holds = f"{output} holds {plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}"
-    return print_import_ending(holds, output, report)
+    if report is None:
+        return print_ending(holds, "see what they tell", "omnibench", "inspect", output)
+    if report.command:
+        then = "mend what it warns of" if report.verdict == "ready" else "mend it"
+        return print_ending(holds, then, *shlex.split(report.command))
+    if report.verdict == "ready":
+        return print_ending(holds, "calibrate it", "omnibench", "calibrate", output, "-o", "calibration.yaml")
+    return print_ending(holds, "see what is missing", "omnibench", "check", output)
 
 
 @recording_app.command()
@@ -213,8 +220,8 @@ def check(
     """
     from omnibench.check.check import check_recording
     from omnibench.check.source import read_source
-    from omnibench.cli.terminal.recording_tables import print_check
     from omnibench.config import parse_settings
+    from omnibench.report.recording.inspection_report import CheckResult
 
     page.refuse(force=force)
     shared.load_given_plugins([Path("none")], plugin)
@@ -222,16 +229,9 @@ def check(
         read = read_source(source, importer, parse_settings(settings), robot)
         checked = check_recording(read)
 
-    def document() -> "Document":
-        from omnibench.report.recording.inspection_report import check_document
-
-        return check_document(read.dataset, checked)
-
-    page.write(document, announced=True)
-    if as_json:
-        print_json(checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"}))
-    else:
-        print_check(make_console(), checked, read.next_command())
+    result = CheckResult(checked, read.dataset, read.next_command())
+    page.write(result.document, announced=True)
+    show(result, as_json)
     if checked.verdict != "ready":
         raise typer.Exit(1)
 
@@ -248,26 +248,15 @@ def inspect(
     as_json: bool = shared.JSON,
 ) -> None:
     """Show what a data set holds, and what can be identified from it."""
-    from omnibench.cli.terminal.recording_tables import print_inspection
-    from omnibench.report.recording.inspection_report import inspection_document
+    from omnibench.report.recording.inspection_report import InspectionResult
 
     page.refuse(force=force)
     with ProgressDisplay() as watch, jobs.opened(watch):
         recordings = omnibench.load_dataset(dataset)
         inspection = omnibench.inspect_dataset(recordings)
-    page.write(lambda: inspection_document(recordings, inspection), announced=True)
-    if as_json:
-        return print_json(inspection)
-    print_inspection(make_console(), inspection)
-    warn(inspection.warnings)
-    named = dataset[0] if len(dataset) == 1 else recordings.name
-    missing = [each.motion for each in inspection.identifiability.directions if each.state != "driven" and each.motion]
-    if missing:
-        return print_ending(
-            f"{named} hardly tells {' or '.join(missing)}", "read what to drive", "omnibench", "guide", "driving"
-        )
-    told = f"{named} determines {'all' if not inspection.identifiability.sentences else 'most'} of the matrix"
-    return print_ending(told, "calibrate it", "omnibench", "calibrate", *dataset, "-o", "calibration.yaml")
+    result = InspectionResult(inspection, recordings, dataset)
+    page.write(result.document, announced=True)
+    show(result, as_json)
 
 
 @recording_app.command(cls=shared.ModelCommand)
@@ -288,9 +277,8 @@ def design(
     These are the runs from which the matrix would be calibrated most precisely (D-optimal design): of those that were
     recorded or that a config lists, or, with --robot, of lines, arcs and turns that fit robot and room.
     """
-    from omnibench.cli.terminal.recording_tables import print_design
     from omnibench.config import to_json
-    from omnibench.design.report import design_document
+    from omnibench.design.report import DesignResult
 
     shared.refuse_figures_without_browser(figures)
     if output is not None:
@@ -300,15 +288,9 @@ def design(
     if output is not None:
         write_text(output / "design.json", to_json(chosen) + "\n")
     page = shared.ReportOptions(None if output is None else output / "report.html", figures)
-    page.write(lambda: design_document(chosen))
-    if as_json:
-        return print_json(chosen)
-    print_design(make_console(), chosen)
-    if output is not None:
-        typer.echo(f"report: {output / 'report.html'}")
-    what = plural(chosen.sets[0].step.effort.runs, "run")
-    drive = "drive them and make a data set of the recordings (omnibench guide data)"
-    return print_ending(f"{what} tell the most of {chosen.robot}", drive)
+    result = DesignResult(chosen, output)
+    page.write(result.document)
+    show(result, as_json)
 
 
 @recording_app.command(cls=shared.ModelCommand)
@@ -328,33 +310,18 @@ def slam(
 
     Each scan is matched against a map that grows from scan to scan.
     """
-    from omnibench.cli.terminal.recording_tables import print_slam
+    from omnibench.report.recording.section import ReferencePosesResult
 
     shared.load_given_plugins(plugins)
     page.refuse(force=force)
     if output is None and not page.asked and not as_json:
         raise ConfigError("say where the poses go: -o DATASET; or ask for figures alone: --json, --report FILE.html")
     with ProgressDisplay() as watch:
-        result = request.run(watch, table_format)
-
-        def document() -> "Document":
-            from omnibench.report.recording.section import recording_document
-
+        result = ReferencePosesResult(request.run(watch, table_format), output, page.report)
+        if page.asked:
             watch(Progress("writing the report"))
-            return recording_document(result.dataset, truth=result.truth, accuracy=result.summary.accuracy)
-
-        page.write(document)
-    warn(result.summary.warnings)
-    if as_json:
-        return print_json(result.summary)
-    print_slam(make_console(), result.summary)
-    for what, file in (("report", page.report), (plural(result.summary.runs, "trajectory"), output)):
-        if file is not None:
-            typer.echo(f"{what}: {file}")
-    poses = f"{plural(result.summary.scans, 'scan')} gave poses"
-    if output is None:
-        return print_ending(f"{poses}, which are written nowhere", "write a data set with them with -o DATASET")
-    return print_ending(poses, "calibrate with them", "omnibench", "calibrate", output, "-o", "calibration.yaml")
+        page.write(result.document)
+    show(result, as_json)
 
 
 @recording_app.command(cls=shared.ModelCommand)
@@ -388,9 +355,10 @@ def simulate(
         page.write(document)
     warn(made.dataset.warnings)
     if made.accuracy is not None:
-        from omnibench.cli.terminal.recording_tables import print_slam_accuracy
+        from omnibench.report.recording.section import error_table
+        from omnibench.report.terminal import print_table
 
-        print_slam_accuracy(make_console(), made.accuracy)
+        print_table(make_console(), error_table(made.accuracy))
     if request.truth is not None:
         typer.echo(f"truth: {request.truth / 'truth.yaml'}")
     if page.report is not None:

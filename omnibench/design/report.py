@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import cycle
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,9 +27,51 @@ from omnibench.report.numbers import (
     percent,
     significant,
 )
+from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
+
+
+class DesignResult(Result):
+    """A design. folder: where its files are, None if nowhere."""
+
+    def __init__(self, design: Design, folder: Path | None = None) -> None:
+        self.design, self.folder = design, folder
+
+    def opening(self) -> Sequence[Remark]:
+        design, use = self.design, USE_IN_WORDS[self.design.use]
+        simulated = " (simulated data)" if design.simulated else ""
+        kind = simulated if design.recorded else " (assumed)"
+        first = f"{design.name}{kind}: robot {design.robot}, D-optimal per {design.per}, {use}"
+        return [Remark(first), Remark(origin_in_words(design))]
+
+    def tables(self) -> Sequence[page.Table]:
+        design = self.design
+        of_sets = [(chosen_table(design, each), effort_table(design, each)) for each in design.sets]
+        return [*(table for tables in of_sets for table in tables), equal_table(design)]
+
+    def remarks(self) -> Sequence[Remark]:
+        lines = []
+        for of_set in self.design.sets:
+            lines += [choice_in_words(self.design, of_set), motions_in_words(of_set)]
+            if not self.design.recorded:
+                lines += ["What to drive:", *(f"  {each}" for each in plan_in_words(self.design, of_set))]
+        lines += [f"- {note}" for note in self.design.notes]
+        lines += [] if self.folder is None else [f"report: {self.folder / 'report.html'}"]
+        return list(map(Remark, lines))
+
+    def next_step(self) -> NextStep:
+        what = plural(self.design.sets[0].step.effort.runs, "run")
+        drive = "drive them and make a data set of the recordings (omnibench guide data)"
+        return NextStep(f"{what} tell the most of {self.design.robot}", drive)
+
+    def document(self) -> page.Document:
+        return design_document(self.design)
+
+    def json(self) -> Design:
+        return self.design
+
 
 USE_IN_WORDS: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
 UNIT_OF_COST: Mapping[Per, str] = {"run": "runs", "second": "s", "metre": "m of wheel"}
@@ -205,11 +249,6 @@ def precision_figures(design: Design) -> page.FigureGrid:
             f"All elements together, as a multiple of the baseline's ({baseline})",
             _curves(design, _RUNS, "runs", [_RELATIVE], "standard deviation / baseline's"),
             "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
-        ),
-        page.Figure(
-            "All elements together, against the time of driving",
-            _curves(design, _SECONDS, "time of driving (s)", [_RELATIVE], "standard deviation / baseline's"),
-            "Geometric mean of the standard deviations against the time of driving, on logarithmic scales",
         ),
         page.Figure(
             "Rows of the matrix: x solid, y dashed, heading dotted",
@@ -501,6 +540,8 @@ def design_document(design: Design) -> page.Document:
         ]
         equal = f"{of_set.name} equals the baseline with {equal_in_words(design, of_set, design.use)}"
         blocks.append(page.Paragraph(f"{equal}, calibrated from {USE_IN_WORDS[design.use]}.", "note"))
+    curves = precision_figures(design)
+    left = curves.figures[1:] if len(design.sets) == 1 else curves.figures[:2]  # the first may be in the answer
     return page.Document(
         title=f"Which commands are worth driving: {design.name}",
         subtitle=design.description,
@@ -510,7 +551,7 @@ def design_document(design: Design) -> page.Document:
             page.Section(
                 "precision",
                 "Precision against runs",
-                (precision_figures(design), promise_table(design), equal_table(design)),
+                (replace(curves, figures=left), promise_table(design), equal_table(design)),
                 about="How well the matrix is known after so many runs, beside the baseline.",
                 folded=True,
             ),
@@ -555,7 +596,11 @@ def _answer(design: Design) -> page.Section:
         title = "What to drive" + " of {}" * (len(design.sets) > 1)
         plans = [page.Callout(title.format(of_set.name), plan_in_words(design, of_set)) for of_set in design.sets]
     notes = page.Callout("Before you rely on it", design.notes)
-    return page.answer_section(headline(design), tiles, path_figures(design), *plans, notes)
+    picture = path_figures(design)
+    if len(picture.figures) == 1:  # beside the paths there is room for what they give
+        both = (*picture.figures, precision_figures(design).figures[0])
+        picture = replace(picture, figures=both, columns=2)
+    return page.answer_section(headline(design), tiles, picture, *plans, notes)
 
 
 def _basis(design: Design) -> tuple[page.Block, ...]:

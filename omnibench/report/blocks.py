@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 if TYPE_CHECKING:  # a terminal shows tables and needs no plots
     import plotly.graph_objects as go
 
-Tone = Literal["plain", "good", "warning"]
+Tone = Literal["plain", "good", "warning", "bad"]
 Dash = Literal["solid", "dash", "dot", "dashdot"]
 
 

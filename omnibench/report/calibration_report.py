@@ -1,34 +1,368 @@
-"""The report of a calibration, by ``calibrate`` or ``evaluate``: before and after, paths, parameters, errors by motion.
-
-Its table of parameters is the terminal's, too.
-"""
+"""A calibration and an evaluation as they are shown: parameters, matrix, errors before and after, paths, motions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+import polars as pl
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.fit.evaluate import final_errors, positions_and_headings
+from omnibench.errors import ConfigError, DataError, require_type
+from omnibench.fit.calibrate import CalibrationRun
+from omnibench.fit.evaluate import Evaluation, SplitErrors, final_errors, positions_and_headings
 from omnibench.fit.path_errors import PathError, predicted_errors
 from omnibench.report import blocks as page
-from omnibench.report.figures import marks
-from omnibench.report.numbers import NOTHING, fixed, percent, significant, typeset
+from omnibench.report.figures import drawn, marks
+from omnibench.report.numbers import NOTHING, fixed, noise_in_words, percent, significant, typeset
 from omnibench.report.path_pictures import CALIBRATED, DESIGN_ITEM, Models, paths_before_after
-from omnibench.report.style import plot
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.report.style import plot, text
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
-from omnibench.robot.kinematics import Array
+from omnibench.robot.export.formats import export_calibration, left_out
+from omnibench.robot.kinematics import Array, relative_deviations
 from omnibench.robot.model import OdometryModel
+from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
 
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
+_ROWS = (("x", "m/rad"), ("y", "m/rad"), ("w", "rad/rad"))
+_COLUMNS = 3  # drive signals whose elements stand side by side in 80 columns; of more, each has a row
+_SCREEN, _WIDTH = 25, 80  # lines and columns of a terminal that hold the answer
+_ENDING = (96 * ".", "COMMAND")  # as long as the sentence that a command ends with
+_TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
+_FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
 _TURNS = 0.35  # rad: a run that turns less in all is straight; chosen
 _ON_THE_SPOT = 0.5  # m a radian: a run that drives less turns on the spot, as seen from the wheels' reach; chosen
-_HEADING = 24  # letters of a title that is the heading of a column
-_INTERVAL_WIDTH = 22  # px that the plot of a parameter takes
+
+
+class CalibrationResult(Result):
+    """A calibration or a run of ``calibrate``.
+
+    file: where it was written, None if nowhere. sources: the data sets as they were typed. dataset: for the page.
+    verdict: by held-out runs, by default that of its file. again: words that write it. box: that was searched.
+    """
+
+    def __init__(
+        self,
+        shown: Calibration | CalibrationRun,
+        dataset: Dataset | None = None,
+        verdict: HeldOutVerdict | None = None,
+        file: Path | None = None,
+        sources: Sequence[Path] = (),
+        again: Sequence[str] = (),
+        box: object = None,
+    ) -> None:
+        self.box = "" if box is None else f" {box!r}"
+        self.run = shown if isinstance(shown, CalibrationRun) else None
+        self.calibration = shown.calibration if isinstance(shown, CalibrationRun) else shown
+        origin = self.calibration.provenance
+        self.verdict = verdict or (None if origin is None else origin.held_out)
+        self.dataset, self.file, self.sources, self.again = dataset, file, sources, again
+        self.parameters = _physical(self.calibration)
+        fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
+        name, robot = self.calibration.name, self.calibration.robot.name
+        self.title = f"{type(shown).__name__} {name!r} of robot {robot}{fitted}"
+
+    @property
+    def warnings(self) -> list[str]:  # type: ignore[override]
+        """What the data and the search leave open."""
+        if self.run is None:
+            return []
+        found = [*(self.dataset.warnings if self.dataset else ()), *self.run.warnings]
+        if bounds := ", ".join(self.run.result.at_bounds):
+            found.append(f"on a bound of the box{self.box}: {bounds}; a wider box may fit better")
+        if untouched := ", ".join(self.run.untouched):
+            found.append(f"not fitted, kept at the start value by the box{self.box} or the cost: {untouched}")
+        return found
+
+    def sentence(self) -> str:
+        return "" if self.verdict is None else self.verdict.sentence
+
+    def next_step(self) -> NextStep:
+        if self.file is None:
+            return NextStep("the calibration above is written nowhere", "write it to a file", tuple(self.again))
+        if self.run is not None and self.run.result.at_bounds:
+            what = f"{self.file} lies on a bound of what was searched: robot.yaml may be wrong, do not use it"
+            return NextStep(what, "see what is", ("omnibench", "check", *self.sources))
+        return next_step(self.calibration, self.verdict, self.file, self.sources)
+
+    def tables(self) -> Sequence[page.Table]:
+        """Parameters, and the matrix as far as a screen holds both."""
+        if not self.parameters:
+            return [self._elements()]
+        tables = [parameter_table(self.calibration, self._heading), self.matrix_table()]
+        lines = [*self.warnings, *(remark.text for remark in self._beside), *_ENDING]
+        height = sum(-(-len(line) // _WIDTH) for line in lines) + sum(2 + len(table.rows) for table in tables)
+        return tables if height <= _SCREEN else tables[:1]
+
+    @property
+    def _heading(self) -> str:
+        origin = self.calibration.provenance
+        return f"{self.calibration.name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
+
+    def remarks(self) -> Sequence[Remark]:
+        if len(self.tables()) == 2 or not self.parameters:
+            return self._beside
+        size = f"3 x {len(self.calibration.matrix[0])}"
+        return [Remark(f"matrix ({size}): not on this screen; --json shows it, -o writes it"), *self._beside]
+
+    @property
+    def _beside(self) -> list[Remark]:
+        """What is said below the tables, whether or not the matrix is among them."""
+        lines, run = list[str](), self.run
+        if run is not None and run.uncertainty is not None:
+            lines.append(f"95 % intervals: {run.uncertainty.source}")
+        if run is not None and run.result.outcome != "converged":
+            lines.append(f"{run.result.outcome}: {run.result.reason}")
+        if self.file is not None:
+            lines.append(f"calibration: {self.file}")
+        return [*map(Remark, lines), *(verdict_remarks(self.verdict) if self.file or self.again else ())]
+
+    def json(self) -> Calibration:
+        return self.calibration
+
+    def document(self) -> page.Document:
+        assert self.dataset is not None
+        verdict = self.verdict or HeldOutVerdict(verdict="unknown", sentence="not judged by other runs", detail="")
+        return calibration_document(self.calibration, self.dataset, verdict, self.run.warnings if self.run else ())
+
+    def matrix_table(self) -> page.Table:
+        """The matrix with its deviation from the design values: a column a drive signal, of more than three a row."""
+        calibration, drive = self.calibration, self.calibration.robot.drive
+        shares = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
+        cells = [
+            [page.Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(*row, strict=True)]
+            for row in zip(calibration.matrix, shares, strict=True)
+        ]
+        headings = [f"wheel {name}" if drive.direct else name for name in drive.names]
+        labels = [f"{row} ({unit})" for row, unit in _ROWS]
+        if len(headings) > _COLUMNS:
+            headings, labels, cells = labels, headings, [list(column) for column in zip(*cells, strict=True)]
+        rows = (page.Row.of(label, *row) for label, row in zip(labels, cells, strict=True))
+        return page.Table(
+            "", (page.Column("matrix", numeric=False), *map(page.Column, headings)), tuple(rows), self._kept
+        )
+
+    @property
+    def _kept(self) -> str:
+        """Motions of which the data say nothing."""
+        kept = () if self.run is None else self.run.kept
+        motions = " and ".join(f"{each.words} ({each.motion})" for each in kept)
+        return f"the design values are kept along {motions}, of which these data say nothing" if kept else ""
+
+    def _elements(self) -> page.Table:
+        """The elements of a matrix that has no reading as parameters, a row each, as parameters are shown."""
+        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
+        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
+        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
+            low, high = row.get("low"), row.get("high")
+            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
+            values = (f"{row[name]:+.7f}" for name in ("design", "value"))
+            rows.append(
+                page.Row.of(f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(float(share)), interval)
+            )
+        columns = (page.Column(name) for name in ("design", "value", "", "change", "95 %"))
+        heading = page.Column(self._heading, numeric=False)
+        return page.Table("", (heading, *columns), tuple(rows), self._kept)
+
+    def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"matrix": self._matrix, "parameters": self._parameters}
+
+    def _parameters(self) -> pl.DataFrame:
+        schema = {"name": pl.String, "design": pl.Float64, "value": pl.Float64, "unit": pl.String}
+        rows = [each.model_dump() for each in self.parameters.values()]
+        return pl.DataFrame(rows, {**schema, "low": pl.Float64, "high": pl.Float64})
+
+    def _matrix(self) -> pl.DataFrame:
+        """Elements with their standard deviations by the covariance; of a run also with their 95 % intervals.
+
+        A file does not say by how many runs its covariance is known, and so has no intervals.
+        """
+        calibration, signals = self.calibration, self.calibration.robot.drive.names
+        columns = {"value": calibration.matrix_array, "design": calibration.robot.inverse_kinematic_matrix}
+        columns["standard_deviation"] = np.full(columns["value"].shape, np.nan)
+        if calibration.covariance is not None:
+            variances = np.diag(np.array(calibration.covariance))[: columns["value"].size]
+            columns["standard_deviation"] = np.sqrt(np.where(variances > 0, variances, np.nan))
+        if self.run is not None and self.run.uncertainty is not None:
+            columns |= {end: getattr(self.run.uncertainty.intervals, end) for end in ("low", "high")}
+        names = ("x", "y", "heading")
+        named = {
+            "row": [name for name in names for _ in signals],
+            "signal": [*signals] * len(names),
+            "unit": [unit for _, unit in _ROWS for _ in signals],
+        }
+        return pl.DataFrame(named | {name: each.ravel() for name, each in columns.items()}).fill_nan(None)
+
+    def figure(self, dataset: Dataset | None = None) -> go.Figure:
+        """The parameters' changes from the design or, with a data set, paths of a few runs before and after."""
+        if dataset is None:
+            return self._deviations()
+        require_type(dataset, Dataset, "load_dataset")
+        self.calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
+        held_out = dataset.split("validation")
+        runs = [run for run in held_out or dataset.trajectories if len(run.poses) > 1]
+        grid = paths_before_after(runs, _models(self.calibration, dataset), "held-out" if held_out else "")
+        if grid is None:
+            raise DataError(f"data set {dataset.name}: no run has a path of poses to draw")
+        return drawn(grid)
+
+    def _deviations(self) -> go.Figure:
+        """Each element's difference from the design, in % of its row's scale, with its interval or its deviation."""
+        frame = self._matrix()
+        scales = np.repeat(self.calibration.robot.row_scales, len(self.calibration.robot.drive.names)) / 100
+        value, deviation = frame["value"], frame["standard_deviation"]
+        bars, ends = "standard deviations", (value - deviation, value + deviation)
+        if "low" in frame.columns:
+            bars, ends = "95 % intervals", (frame["low"], frame["high"])
+        names = [f"{row}: {signal}" for row, signal in zip(frame["row"], frame["signal"], strict=True)]
+        scaled = [((column - frame["design"]) / scales).to_list() for column in (value, *ends)]
+        title = f"{self.calibration.name}: elements of the matrix with {bars}"
+        grid = page.FigureGrid((_intervals(title, "difference from the design, % of the row's scale", names, *scaled),))
+        return drawn(grid)
+
+
+class EvaluationResult(Result):
+    """An evaluation: errors on every split beside those of the design, and errors to expect on paths.
+
+    evaluation: None where only paths were asked for. The other arguments are those of a calibration's result.
+    """
+
+    def __init__(
+        self,
+        evaluation: Evaluation | None,
+        calibration: Calibration | None = None,
+        paths: Sequence[PathError] = (),
+        dataset: Dataset | None = None,
+        file: Path | None = None,
+        sources: Sequence[Path] = (),
+        warnings: Sequence[str] = (),
+    ) -> None:
+        self.evaluation, self.calibration, self.paths, self.dataset = evaluation, calibration, paths, dataset
+        self.file, self.sources, self.warnings = file, sources, warnings
+        if evaluation is not None:
+            self.title = f"Evaluation on {evaluation.dataset!r}, {plural(evaluation.trajectories, 'run')}"
+
+    def sentence(self) -> str:
+        return "" if self.evaluation is None else self.evaluation.held_out.sentence
+
+    def next_step(self) -> NextStep:
+        if self.evaluation is None:
+            other = ("omnibench", "evaluate", self.file, "DATASET")
+            return NextStep("these errors are predicted", "see those on recordings", other)
+        assert self.calibration is not None
+        assert self.file is not None
+        return next_step(self.calibration, self.evaluation.held_out, self.file, self.sources)
+
+    def tables(self) -> Sequence[page.Table]:
+        tables = [] if self.evaluation is None else [error_table(self.evaluation)]
+        if self.evaluation is not None and any(errors.references for errors in self.evaluation.splits.values()):
+            tables.append(reference_table(self.evaluation))
+        if self.paths and self.calibration is not None:
+            tables.append(path_table(self.paths, self.calibration))
+        return tables
+
+    def remarks(self) -> Sequence[Remark]:
+        if self.evaluation is None or self.calibration is None:
+            return ()
+        return [*verdict_remarks(self.evaluation.held_out), *map(Remark, self.evaluation.sessions)]
+
+    def json(self) -> Mapping[str, Any]:
+        document = {} if self.evaluation is None else self.evaluation.model_dump()
+        return document | {"paths": [each.model_dump() for each in self.paths], "warnings": list(self.warnings)}
+
+    def document(self) -> page.Document:
+        assert self.evaluation is not None
+        assert self.calibration is not None
+        assert self.dataset is not None
+        return calibration_document(self.calibration, self.dataset, self.evaluation.held_out, self.evaluation.warnings)
+
+    def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        assert self.evaluation is not None
+        told = any(errors.references for errors in self.evaluation.splits.values())
+        return {"splits": self._splits, **({"references": self._references} if told else {})}
+
+    def _splits(self) -> pl.DataFrame:
+        rows = [labels | {name: vars(errors)[name] for name in _FINAL} for labels, errors in self._of_models()]
+        return pl.DataFrame(rows, infer_schema_length=None)
+
+    def _references(self) -> pl.DataFrame:
+        return pl.DataFrame([labels | dict(at) for labels, errors in self._of_models() for at in errors.references])
+
+    def _of_models(self) -> Iterator[tuple[dict[str, Any], SplitErrors]]:
+        """The errors on every split with its name and the model's."""
+        assert self.evaluation is not None
+        for model, splits in (("calibration", self.evaluation.splits), ("design", self.evaluation.design)):
+            for split, errors in splits.items():
+                yield {"split": split, "model": model}, errors
+
+    def figure(self) -> go.Figure:
+        """Mean position errors on every split, before and after."""
+        frame = self._splits()
+        bars = []
+        for model, item in (("design", DESIGN_ITEM), ("calibration", _CALIBRATED)):
+            rows = frame.filter(pl.col("model") == model)
+            values = (1000 * rows["position_mean_m"].cast(pl.Float64)).to_list()
+            bars.append(go.Bar(x=rows["split"].to_list(), y=values, name=model, marker_color=item.colour))
+        figure = go.Figure(bars, layout=plot(y_title="mean position error at the end (mm)").layout)
+        return figure.update_layout(title_text=text(f"{self.title}: before and after"), showlegend=True)
+
+
+def next_step(
+    calibration: Calibration, verdict: HeldOutVerdict | None, file: Path, sources: Sequence[Path]
+) -> NextStep:
+    """The end of ``calibrate`` and ``evaluate``: use a calibration, record more, or look for faults."""
+    found, inspect = "unknown" if verdict is None else verdict.verdict, ("omnibench", "inspect", *sources)
+    if found == "better" and verdict is not None:
+        basis = "on runs that were held out" if verdict.basis == "held_out" else "by cross-validation"
+        return NextStep(f"{file} is better than the design {basis}", *how_to_use(calibration, file))
+    if found == "worse":
+        return NextStep(f"{file} is worse than the design: do not use it", "see what the recordings lack", inspect)
+    if found == "undecided":
+        more = "record more runs for validation; what these tell"
+        return NextStep(f"whether {file} is better than the design is open", more, inspect)
+    other = ("omnibench", "evaluate", file, "DATASET")
+    return NextStep(f"{file} was not judged by other runs", "try it on a recording that it was not fitted to", other)
+
+
+def how_to_use(calibration: Calibration, file: Path) -> tuple[str, tuple[object, ...]]:
+    """The next step with a calibration, then the words to type: an export, or a node if none holds it."""
+    if calibration.plain is None and left_out(calibration):
+        return "name it in the config of a live node, which alone has its effects", ("omnibench", "guide", "live")
+    # The format to try first: parameters of a ROS 2 controller where one suits the robot.
+    export_format = "ros2_controllers"
+    try:
+        export_calibration(calibration, export_format)
+    except ConfigError:
+        export_format = "c_header"
+    return "use it on the robot", ("omnibench", "export", file, "--to", export_format)
+
+
+def verdict_remarks(verdict: HeldOutVerdict | None) -> list[Remark]:
+    """What held-out runs say, and which these are."""
+    if verdict is None:
+        return []
+    detail, _, _ = verdict.detail.partition("; runs: ")  # which runs these are, the report says
+    return [Remark(verdict.sentence, _TONES[verdict.verdict]), *([Remark(detail)] if detail else [])]
+
+
+def _physical(calibration: Calibration) -> Mapping[str, PhysicalParameter]:
+    """The physical parameters; none where no wheels near the design have the matrix."""
+    try:
+        return calibration.physical_parameters
+    except DataError:
+        return {}
+
+
+def _models(calibration: Calibration, dataset: Dataset) -> Models:
+    """The design and the calibration."""
+    design = OdometryModel.of_design(dataset.robot, calibration.integration)
+    return ((DESIGN_ITEM, design), (_CALIBRATED, calibration.model))
 
 
 def calibration_document(
@@ -40,48 +374,49 @@ def calibration_document(
     """
     judged = [run for run in dataset.trajectories if run.id in set(verdict.runs)]
     runs, which = (judged, "held-out") if judged else (list(dataset.trajectories), "recorded")
-    design = OdometryModel.of_design(dataset.robot, calibration.integration)
-    models: Models = ((DESIGN_ITEM, design), (_CALIBRATED, calibration.model))
+    models = _models(calibration, dataset)
     errors = [final_errors(model, runs) for _, model in models]
+    (before, turned_before), (after, turned_after) = map(positions_and_headings, errors)
+    tiles = [
+        page.Fact("Position", f"{_mm(before)} → {_mm(after)}", "mean error of the final pose"),
+        page.Fact("Heading", f"{_degrees(turned_before)} → {_degrees(turned_after)}", "mean error of the final pose"),
+    ]
+    if verdict.improvement is not None:
+        known = verdict.low is not None and verdict.high is not None
+        interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
+        tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
+    sections = []
+    if _physical(calibration):
+        blocks: tuple[page.Block, ...] = (parameter_table(calibration),)
+        if (figure := _changes(calibration)) is not None:
+            blocks = (page.FigureGrid((figure,), (_CALIBRATED,), 1, "", "parameters"), *blocks)
+        sections.append(page.Section("parameters", "Radii, lengths and angles", blocks))
     by_motion = _by_motion(runs, errors)
-    parameters = tuple(calibration.physical_parameters.values())
-    of_robot = [page.Section("parameters", "Radii, lengths and angles", (parameter_table(calibration),))]
-    if any(each.low is not None for each in parameters):
-        changes = (page.FigureGrid((_changes(calibration),), (_CALIBRATED,), 1, "", "parameters"), *of_robot[0].blocks)
-        of_robot = [page.Section("parameters", "Radii, lengths and angles", changes)]
+    about = f"Errors of the final pose of the {which} runs, by what the robot drove."
+    pictures = (_motion_figure(by_motion),) if len(runs) > len(by_motion) else ()  # a dot a motion is in the table
+    sections.append(page.Section("motions", "Errors by motion", (*pictures, _motion_table(by_motion)), about=about))
+    if predicted := predicted_errors(calibration):
+        about = "Expected errors at the end, from the calibration's uncertainty and the slip that its runs showed."
+        title = "What to expect on other paths"
+        sections.append(page.Section("paths", title, (path_table(predicted, calibration),), about=about))
+    matrix = CalibrationResult(calibration).matrix_table()
+    sections.append(page.Section("matrix", "The matrix", (matrix,), about="What is computed."))
+    made = (_facts(calibration, verdict),)
+    sections.append(page.Section("origin", "How it was made", made, about="Data, fit, noise, versions."))
     return page.Document(
         title=f"Calibration of {dataset.robot.name}",
         subtitle=f"{calibration.name}, on {plural(len(runs), f'{which} run')} of {dataset.name}",
         sections=(
             page.answer_section(
                 typeset(f"{verdict.sentence}."),
-                _tiles(errors, verdict),
+                tiles,
                 paths_before_after(runs, models, which),
                 page.Callout("What these data leave open", tuple(map(typeset, warnings)), "warning"),
             ),
-            *(of_robot if parameters else ()),
-            page.Section(
-                "motions",
-                "Errors by motion",
-                (_motion_figure(by_motion), _motion_table(by_motion)),
-                about=f"Errors of the final pose of the {which} runs, by what the robot drove.",
-            ),
-            *_paths(calibration),
-            page.Section("matrix", "The matrix", (_matrix_table(calibration),), folded=True, about="What is computed."),
-            page.Section(
-                "origin", "How it was made", (_facts(calibration, verdict),), folded=True, about="Data, fit, versions."
-            ),
+            *sections,
         ),
         badges=page.simulated_badge(dataset.simulated),
     )
-
-
-def _paths(calibration: Calibration) -> tuple[page.Section, ...]:
-    """What the robot will do on usual paths; nothing where no covariance tells."""
-    errors = predicted_errors(calibration)
-    about = "Expected errors at the end, from the calibration's uncertainty and the slip that its runs showed."
-    table = path_table(errors, calibration)
-    return (page.Section("paths", "What to expect on other paths", (table,), about=about),) if errors else ()
 
 
 def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
@@ -104,9 +439,62 @@ def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
         page.Column("change"),
         page.Column("95 %"),
     )
-    heading = title.replace(" ", "\N{NO-BREAK SPACE}") if 0 < len(title) <= _HEADING else "parameter"
-    caption = title if len(title) > _HEADING else ""
-    return page.Table(caption, (page.Column(heading, numeric=False), *headings), tuple(rows))
+    return page.Table("", (page.Column(title or "parameter", numeric=False), *headings), tuple(rows))
+
+
+def error_table(evaluation: Evaluation) -> page.Table:
+    """Cost and errors of the final pose on every split, by the calibration and by the design."""
+    rows = []
+    for split, errors in evaluation.splits.items():
+        if split == "all" and len(evaluation.splits) > 2:  # the rows above say it
+            continue
+        where = f"{split}: {plural(errors.trajectories, 'run')}"
+        if evaluation.unfitted is not None:
+            part, whole = evaluation.unfitted[split], errors.trajectories
+            where += f", {({0: 'none', whole: 'all'}).get(part, f'{part:,}')} held out"
+        if errors.outside is not None:
+            where += f", {100 * errors.outside:.0f} % of the time outside of what it was fitted to"
+        for label, each in (("calibration", errors), ("design", evaluation.design[split])):
+            metres = (fixed(value, 4) for value in (each.position_mean_m, each.position_max_m))
+            angles = (each.heading_mean_rad, each.heading_max_rad)
+            degrees = (fixed(None if value is None else math.degrees(value), 2) for value in angles)
+            rows.append(page.Row.of(where, label, f"{each.cost:.4f}", *metres, *degrees))
+            where = ""
+    columns = (
+        page.Column("runs", numeric=False),
+        page.Column("model", numeric=False),
+        page.Column("Eq. (6)"),
+        *(page.Column(f"position, {which}", "m") for which in ("mean", "max")),
+        *(page.Column(f"heading, {which}", "deg") for which in ("mean", "max")),
+    )
+    kind = " (simulated data)" if evaluation.simulated else ""
+    note = f"fitted with the loss {evaluation.loss}; the errors are without it" if evaluation.loss else ""
+    return page.Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note)
+
+
+def reference_table(evaluation: Evaluation) -> page.Table:
+    """Errors at references other than poses, by kind."""
+    rows = []
+    for split, errors in evaluation.splits.items():
+        for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
+            values = [value for at in (fitted, before) for value in (at.mean, at.max)]
+            angle = fitted.unit == "rad"
+            sizes = (f"{math.degrees(value):.2f} deg" if angle else f"{1000 * value:.1f} mm" for value in values)
+            ratios = (f"{fitted.in_sigmas:.1f}", f"{before.in_sigmas:.1f}")
+            rows.append(page.Row.of(split, fitted.kind, str(fitted.references), *sizes, *ratios))
+    columns = (
+        page.Column("runs", numeric=False),
+        page.Column("reference", numeric=False),
+        page.Column("number"),
+        page.Column("mean"),
+        page.Column("largest", priority=1),
+        page.Column("design: mean"),
+        page.Column("largest", priority=1),
+        page.Column("in sigmas"),
+        page.Column("design: in sigmas", priority=1),
+    )
+    note = "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
+    return page.Table("errors by kind of reference", columns, tuple(rows), note)
 
 
 def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Table:
@@ -132,20 +520,6 @@ def _figures(value: float) -> str:
     return f"{value:.1f}" if value < 10 else f"{value:.0f}"
 
 
-def _tiles(errors: Sequence[Array], verdict: HeldOutVerdict) -> tuple[page.Fact, ...]:
-    """Mean final errors before and after, and the improvement."""
-    (before, turned_before), (after, turned_after) = (positions_and_headings(of_model) for of_model in errors)
-    tiles = [
-        page.Fact("Position", f"{_mm(before)} → {_mm(after)}", "mean error of the final pose"),
-        page.Fact("Heading", f"{_degrees(turned_before)} → {_degrees(turned_after)}", "mean error of the final pose"),
-    ]
-    if verdict.improvement is not None:
-        known = verdict.low is not None and verdict.high is not None
-        interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
-        tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
-    return tuple(tiles)
-
-
 def _mm(distances: Array) -> str:
     return f"{significant(1e3 * float(distances.mean()))} mm"
 
@@ -154,26 +528,38 @@ def _degrees(angles: Array) -> str:
     return f"{fixed(math.degrees(float(angles.mean())), 2)}°"
 
 
-def _changes(calibration: Calibration) -> page.Figure:
-    """Each parameter's change from the design with its interval: of lengths in %, of angles in degrees."""
-    names, values, below, above = [], [], [], []
+def _deviation(share: float) -> str:
+    return "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"
+
+
+def _changes(calibration: Calibration) -> page.Figure | None:
+    """Each parameter's change from the design with its interval, lengths in %, angles in degrees; None without any."""
+    names, values = list[str](), list[list[float]]()
     for each in calibration.physical_parameters.values():
         share_of_design = each.unit == "m" and each.design
         if each.low is None or each.high is None or not (each.unit == "rad" or share_of_design):
             continue
         scale = math.degrees(1.0) if each.unit == "rad" else 100 / abs(each.design)
         names.append(f"{each.name} ({'°' if each.unit == 'rad' else '%'})")
-        values.append(scale * (each.value - each.design))
-        below.append(scale * (each.value - each.low))
-        above.append(scale * (each.high - each.value))
-    error = {"type": "data", "array": above, "arrayminus": below}
-    dots = go.Scatter(x=values, y=names, mode="markers", marker={"color": CALIBRATED, "size": 9}, error_x=error)
-    figure = plot(dots, x_title="change from the design: lengths in %, angles in degrees")
+        values.append([scale * (value - each.design) for value in (each.value, each.low, each.high)])
+    title = "Change from the design, with 95 % intervals"
+    across = "change from the design: lengths in %, angles in degrees"
+    return _intervals(title, across, names, *map(list, zip(*values, strict=True))) if names else None
+
+
+def _intervals(title: str, across: str, names: list[str], values: Any, low: Any, high: Any) -> page.Figure:
+    """A dot with its interval for each name; values, low, high: numbers, or None."""
+    bars = [
+        [None if None in (a, b) else a - b for a, b in zip(*ends, strict=True)]
+        for ends in ((high, values), (values, low))
+    ]
+    error = {"type": "data", "array": bars[0], "arrayminus": bars[1]}
+    marker = {"color": CALIBRATED, "size": 9}
+    dots = go.Scatter(x=values, y=list(map(text, names)), mode="markers", marker=marker, error_x=error)
+    figure = plot(dots, x_title=across)
     figure.add_vline(x=0.0, line={"width": 1, "dash": "dot"})
     figure.update_yaxes(autorange="reversed", automargin=True)
-    height = 130 + _INTERVAL_WIDTH * len(names)
-    title = "Change from the design, with 95 % intervals"
-    return page.Figure(title, figure, f"{title}: {', '.join(names)}", height)
+    return page.Figure(title, figure, f"{title}: {', '.join(names)}", 100 + 24 * len(names))
 
 
 def _by_motion(runs: Sequence[Trajectory], errors: Sequence[Array]) -> dict[str, list[Array]]:
@@ -236,20 +622,14 @@ def _motion_table(by_motion: dict[str, list[Array]]) -> page.Table:
     return page.Table("Mean errors of the final pose", columns, tuple(rows))
 
 
-def _matrix_table(calibration: Calibration) -> page.Table:
-    rows = [
-        page.Row.of(label, *(f"{value:+.7f}" for value in row))
-        for label, row in zip(("x (m/rad)", "y (m/rad)", "heading (rad/rad)"), calibration.matrix, strict=True)
-    ]
-    columns = (page.Column("row", numeric=False), *map(page.Column, calibration.robot.drive.names))
-    note = f"Effects beside it: {calibration.effects_in_words}." if calibration.effects else ""
-    return page.Table("Inverse kinematic matrix", columns, tuple(rows), note)
-
-
 def _facts(calibration: Calibration, verdict: HeldOutVerdict) -> page.Facts:
     """Where the calibration comes from, and how to make it again."""
     origin = calibration.provenance
     facts = [page.Fact("Verdict", typeset(verdict.sentence), typeset(verdict.detail))]
+    if calibration.effects:
+        facts.append(page.Fact("Effects", calibration.effects_in_words))
+    if calibration.noise is not None:
+        facts.append(page.Fact("Noise of the reference", "; ".join(noise_in_words(calibration.noise))))
     if origin is not None:
         options = ", ".join(f"{name} {value}" for name, value in origin.options.items())
         facts += [

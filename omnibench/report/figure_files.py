@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 import shutil
 import subprocess
 import tempfile
 import unicodedata
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from omnibench.errors import DataError
 from omnibench.files import write_files
-from omnibench.report.blocks import Block, Choice, Details, Document, FigureGrid, Section
-from omnibench.report.render import figures_page
+from omnibench.report.blocks import Document, FigureGrid
+from omnibench.report.render import figures_page, grids_of
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 _ELSEWHERE = (
@@ -43,20 +41,7 @@ def write_figures(document: Document, folder: Path) -> list[str]:
         return []
     with tempfile.TemporaryDirectory() as scratch:
         page = Path(scratch, "figures.html")
-        # The content of each grid for figures.js.
-        described = [
-            {
-                "name": name,
-                "columns": grid.columns,
-                "legend": [{"label": item.label, "colour": item.colour, "dash": item.dash} for item in grid.legend],
-                "figures": [
-                    {"title": each.title, "height": each.height, **json.loads(each.plot.to_json())}
-                    for each in grid.figures
-                ],
-            }
-            for name, grid in grids.items()
-        ]
-        page.write_text(figures_page(described), encoding="utf-8")
+        page.write_text(figures_page(grids), encoding="utf-8")
         command = [program, *_FLAGS, f"--user-data-dir={scratch}/profile", page.as_uri()]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE, check=False)
@@ -81,7 +66,7 @@ def browser() -> str:
 def named_grids(document: Document) -> dict[str, FigureGrid]:
     """Every grid of figures by a name of its own: its given one, or made of the titles above it."""
     named: dict[str, FigureGrid] = {}
-    for titles, grid in _grids(document.sections, ()):
+    for titles, grid in grids_of(document):
         title = grid.figures[0].title if len(grid.figures) == 1 else ""
         name = grid.name or _slug(" ".join([*titles[-2:], title]))
         chosen = name if grid.name == "" or len(titles) < 2 else _slug(f"{' '.join(titles[1:])} {name}")
@@ -90,24 +75,6 @@ def named_grids(document: Document) -> dict[str, FigureGrid]:
             number += 1
         named[unique] = grid
     return named
-
-
-def _grids(sections: Sequence[Section], titles: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], FigureGrid]]:
-    for section in sections:
-        inside = (*titles, section.title)
-        yield from _of_blocks(section.blocks, inside)
-        yield from _grids(section.sections, inside)
-
-
-def _of_blocks(blocks: Sequence[Block], titles: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], FigureGrid]]:
-    for block in blocks:
-        if isinstance(block, FigureGrid):
-            yield titles, block
-        elif isinstance(block, Details):
-            yield from _of_blocks(block.blocks, (*titles, block.title))
-        elif isinstance(block, Choice):
-            for title, inner in block.options.items():
-                yield from _of_blocks(inner, (*titles, title))
 
 
 def _slug(words: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -13,24 +12,19 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.evaluate import final_errors
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.figures import START, marks, path
-from omnibench.report.numbers import fixed, listing
+from omnibench.report.numbers import fixed
 from omnibench.report.recording.recording_figures import (
-    ON_THE_SPOT,
     REFERENCE_ITEM,
     evenly,
-    kinds_of,
     motion_titles,
-    spread,
 )
 from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.robot.kinematics import Array, rotated
 from omnibench.robot.model import OdometryModel
-from omnibench.words import plural
 
 DESIGN_ITEM = LegendItem("design", "design values", THEORETICAL, "dash")
 CALIBRATED = "#0072b2"
 Models = Sequence[tuple[LegendItem, OdometryModel]]
-_PATHS = 2  # runs whose paths are drawn: with the ends of all, as many pictures as stand side by side
 _WIDTHS = (3.2, 1.8)  # px: before is seen behind after
 _POINTS = 160  # points that a path is drawn with (chosen)
 _ENDS = 500  # ends that are drawn of each model (chosen: more cannot be told apart)
@@ -40,23 +34,24 @@ _TARGET = LegendItem("", "reference's end", INK, symbol="cross-thin-open")
 
 
 def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -> FigureGrid | None:
-    """Paths of two typical runs by the reference and two models, and the ends of all runs; None without a run.
+    """The path of a typical run by the reference and two models, and the ends of all runs; None without a run.
 
-    models: before and after. which: the runs in words, such as ``held-out``. Runs without poses are left out.
+    models: before and after. which: the runs in words, such as ``held-out``. Runs without poses are left out. Typical
+    is the run whose error, m and rad as one length, falls by the median; a turn on the spot has no path to see.
     """
     runs = [run for run in runs if run.has_poses]
     if not runs:
         return None
     ends = [_final_errors(model, runs) for _, model in models]
-    shown, choice = _typical(runs, ends)
-    figures = [_paths(title, run, models) for title, run in shown.items()]
-    figures.append(_all_ends(runs, ends, models, which))
-    names = listing([item.label for item, _ in models])
-    caption = f"{choice} Circle: start; dots: ends. In the titles: mean distance of the end from the reference's, and "
-    caption += f"turn between them, by {names}{', in this order' * (len(models) > 1)}."
-    columns: Literal[1, 2, 3] = 3 if len(figures) == 3 else 2 if len(figures) == 2 else 1
+    gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
+    seen = [index for index, run in enumerate(runs) if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW]
+    ordered = sorted(seen or range(len(runs)), key=lambda index: gains[index])
+    ((title, run),) = motion_titles([runs[ordered[(len(ordered) - 1) // 2]]]).items()
+    figures = (_path(f"{title[0].upper()}{title[1:]}", run, models), _all_ends(runs, ends, models, which))
+    caption = "The run whose error falls by the median. Circle: start; dots: ends. In the titles: distance of the end "
+    caption += "from the reference's, and turn between them, before and after."
     items = (REFERENCE_ITEM, *(item for item, _ in models))
-    return FigureGrid(tuple(figures), items, columns, caption.strip(), "paths-before-after")
+    return FigureGrid(figures, items, 2, caption, "paths-before-after")
 
 
 def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
@@ -66,27 +61,7 @@ def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
     return np.column_stack([along_starts, errors[:, 2]])
 
 
-def _typical(runs: Sequence[Trajectory], ends: Sequence[Array]) -> tuple[dict[str, Trajectory], str]:
-    """Two runs to draw by their titles, one of a kind of motion where kinds are known, and how they were chosen.
-
-    Turns on the spot, which have no path to see, are drawn only where there is nothing else.
-    Of a kind it is the run whose error, m and rad as one length, falls by the median of its kind.
-    """
-    gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
-    gain_of = {run.id: float(gain) for run, gain in zip(runs, gains, strict=True)}
-    kinds = {kind: like for kind, like in kinds_of(runs).items() if kind != ON_THE_SPOT}
-    if len(kinds) < _PATHS:
-        chosen = spread([run for run in runs if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW] or runs, _PATHS)
-        return motion_titles(chosen), f"{plural(len(chosen), 'run')} of different motions." if len(chosen) > 1 else ""
-    medians = {
-        kind: sorted(like, key=lambda run: gain_of[run.id])[(len(like) - 1) // 2] for kind, like in kinds.items()
-    }
-    largest = sorted(medians, key=lambda kind: gain_of[medians[kind].id], reverse=True)[:_PATHS]
-    words = "Of each kind of motion the run whose error falls by the median of its kind."
-    return {f"{kind[0].upper()}{kind[1:]}": run for kind, run in medians.items() if kind in largest}, words
-
-
-def _paths(title: str, run: Trajectory, models: Models) -> Figure:
+def _path(title: str, run: Trajectory, models: Models) -> Figure:
     reference = run.poses[evenly(len(run.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, run.pose_times[-1], _POINTS)
     traces = [path(REFERENCE_ITEM, reference, 3.5), marks(REFERENCE_ITEM, 8, *reference[-1:, :2].T)]

@@ -60,11 +60,9 @@ def test_evaluate_prints_the_documented_document(command: Command, prepared: Pre
 
 def test_evaluate_shows_the_design_values_and_how_many_runs_were_held_out(command: Command, prepared: Prepared) -> None:
     shown = command("evaluate", prepared.calibration, prepared.data).stdout
-    assert shown.count("\ncalibration") == shown.count("\ndesign") == 2
     assert "(simulated data)" in shown
-    assert [line for line in shown.splitlines() if ": 6 runs" in line] == [
-        *("train: 6 runs, none held out", "validation: 6 runs, all held out")
-    ]
+    for split in ("train: 6 runs, none held out", "validation: 6 runs, all held out"):
+        assert re.search(rf"^{split} +calibration", shown, re.MULTILINE)
     assert len(shown.splitlines()) <= 25
 
 
@@ -301,7 +299,8 @@ def test_certify_says_what_is_proven(command: Command, prepared: Prepared) -> No
     assert found["gap"] == pytest.approx(1 - found["lower_bound"] / found["cost"])
     assert found["box"] == "row"
     printed = command("certify", prepared.calibration, prepared.data, "--parts", 1)
-    assert "(simulated data), training split, cost final_pose" in printed.stdout
+    assert "(simulated data), training split" in printed.stdout
+    assert re.search(r"proven lower bound +0\.\d", printed.stdout)
     assert "the box 'row'" in printed.stdout
     assert "1 part of the box examined" in printed.stdout
 

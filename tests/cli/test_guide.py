@@ -23,10 +23,11 @@ import omnibench
 from omnibench.cli import examples
 from omnibench.cli.examples import EXAMPLES, SAMPLES, Example, find_example, write_example
 from omnibench.cli.handbook_topics import HANDBOOK, topics
-from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.config import read_model
 from omnibench.data.recording import RobotOption
+from omnibench.report.calibration_report import CalibrationResult
+from omnibench.report.terminal import print_result
 
 PAGES = [ROOT / "README.md", *sorted(HANDBOOK.rglob("*.md"))]
 BY_NAME = {topic.name: topic for topic in topics()}
@@ -299,7 +300,7 @@ def test_the_sample_holds_every_second_row_of_its_source(command: str) -> None:
 def test_a_row_that_is_zero_by_design_is_called_so_and_warned_of_nowhere() -> None:
     options = {"wheel_unit": "ticks/sample", "ticks_per_turn": 2796.8}
     run = omnibench.calibrate(omnibench.import_dataset("csv", ROBOT / "log", options), "closed_form")
-    alone = replace(run, parameters=())  # which leaves room for the intervals
-    assert on_terminal(print_calibration, alone, width=100).count("by design") == 2
+    bare = replace(run, calibration=run.calibration.model_copy(update={"parameters": {}}))
+    assert on_terminal(print_result, CalibrationResult(bare), width=100).count("by design") == 2
     assert run.result.held == ("m21", "m22")
     assert run.untouched == ()

@@ -22,17 +22,18 @@ from recording_samples import in_room
 from report_page import Page, on_terminal
 from sessions import until
 
-from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.config import parse_yaml
 from omnibench.data.dataset import make_dataset
 from omnibench.data.scans import ScansInMemory, TrajectoryScans
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.data.true_poses import TruePath, write_true_poses
 from omnibench.discover.output import DiscoverOptions, write_discovery
+from omnibench.discover.report.discovery_result import DiscoveryResult
 from omnibench.discover.result import Discovery
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import evaluate
 from omnibench.registry import effects, load_plugins
+from omnibench.report.terminal import print_result, print_table
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.floor_plan import RoomPlan, make_plan
@@ -109,7 +110,8 @@ def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found
         np.testing.assert_allclose(new.final_pose, ends, rtol=0, atol=0.01)
         assert new.pose_covariances is not None
     count = sum(len(before.scans.times(run.id)) for run in before.trajectories)
-    assert f"driven: simulated data; 3 runs, {count} scans, " in found.run.stdout
+    assert "driven, simulated data: reference poses from the scans" in found.run.stdout
+    assert f"3 runs, {count} scans; " in found.run.stdout
     assert "distance from the recorded reference (12 poses)" in " ".join(found.run.stdout.split())
     assert "truth" not in found.run.stdout
     # A busy machine is told every 10 s how far it is; the last sentence has two lines.
@@ -169,9 +171,9 @@ def test_the_truth_gives_errors_bias_and_drift_and_a_report(command: Command, dr
     )
     assert run.returncode == 0, run.stderr
     assert "Errors of the reference poses against the truth" in run.stdout
-    assert "last of each run (3 poses)" in run.stdout
-    assert re.search(r"Mean error along the robot's axes\n[^─]*forward[^─]*left[^─]*heading", run.stdout)
-    assert re.search(r"3 runs, [23]\.\d+ m in all", run.stdout)
+    for row in ("position (mm)", "heading (°)", "forward, signed (mm)", "to the left, signed (mm)", "NEES"):
+        assert re.search(rf"^{re.escape(row)} +[−+\d]", run.stdout, re.MULTILINE)
+    assert re.search(r"3 runs, [23]\.\d+ m in all; drift \S+ mm", run.stdout)
     assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
     assert {file.suffix for file in Path("csv").iterdir()} == {".yaml", ".csv"}
     assert load_dataset("csv").hash == load_dataset(found.data).hash
@@ -297,7 +299,7 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
 
 def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> None:
     run = command("inspect", driven.data)
-    assert "540 rays over 270 deg up to 30 m, of which 100% measured something" in run.stdout
+    assert "540 rays over 270° up to 30 m, 100% measured; in 3 runs" in run.stdout
     document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
     scans = load_dataset(driven.data).scans
     assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)
@@ -475,15 +477,16 @@ SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
     nameless: ("verdict: unknown",),
     incomplete: DRIVE + LEFT_OVER,
     in_doubt: ("load_transfer", "few turns"),
-    many_notes: ("verdict: none", "- note 2 6 more notes", "report: results/flower/now/report.html"),
+    many_notes: ("verdict: none", "- note 2 6 more remarks in the report", "report: results/flower/now/report.html"),
 }
 
 
 @pytest.mark.parametrize("make", SHOWN)
 def test_what_is_found_is_told_on_a_screen_of_eighty_columns(make: Callable[[], Discovery]) -> None:
-    lines = on_terminal(print_discovery, make(), Path("results/flower/now")).splitlines()
-    assert max(len(line.rstrip()) for line in lines) <= 80
-    text = " ".join(" ".join(lines).split())
+    result = DiscoveryResult(make(), Path("results/flower/now"))
+    for table in result.tables():
+        assert max(len(line.rstrip()) for line in on_terminal(print_table, table).splitlines()) <= 80
+    text = " ".join(on_terminal(print_result, result).split())
     assert "…" not in text
     for part in SHOWN[make]:
         assert part in text

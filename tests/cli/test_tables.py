@@ -22,11 +22,8 @@ from wheeled_recordings import PERIOD as RECORDED
 from wheeled_recordings import recorded
 from wheeled_samples import driven
 
-from omnibench.cli.terminal.calibration_tables import print_calibration
-from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.cli.terminal.progress_display import ProgressDisplay
-from omnibench.cli.terminal.recording_tables import print_inspection
-from omnibench.cli.terminal.tables import in_brief, print_table
+from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.fit.calibrate import calibrate
@@ -34,7 +31,12 @@ from omnibench.fit.inspect import inspect_dataset
 from omnibench.fit.problem import Budget
 from omnibench.progress import Progress, Stages
 from omnibench.report.blocks import Cell, Column, Document, Row, Section, Table
+from omnibench.report.calibration_report import CalibrationResult
+from omnibench.report.recording.inspection_report import InspectionResult
 from omnibench.report.render import render
+from omnibench.report.result import Result
+from omnibench.report.terminal import print_result, print_table
+from omnibench.robot.calibration import HeldOutVerdict
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.testing.synthetic import PERIOD, synthetic_trajectories
 
@@ -80,10 +82,6 @@ def test_a_path_may_be_broken_where_it_is_longer_than_a_column_can_be() -> None:
     assert "".join(printed(table, 40).split()).endswith(f"de{path}")
 
 
-def test_in_brief_a_table_has_neither_notes_nor_lesser_columns(snapshot: SnapshotAssertion) -> None:
-    assert printed(in_brief(TABLE), 160) == snapshot
-
-
 def test_one_description_gives_the_cells_of_the_report_and_of_the_terminal() -> None:
     page = Page(render(Document("Report", "", (Section("costs", "Costs", (TABLE,)),))))
     shown = [[" ".join(cell.split()) for cell in row] for row in page.tables[TABLE.caption]]
@@ -116,7 +114,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> ComparisonResult:
 
 
 def compared_text(result: ComparisonResult, width: int) -> str:
-    return on_terminal(print_result, result, width=width, everything=True)
+    return on_terminal(print_result, ComparisonView(result, everything=True), width=width)
 
 
 def test_all_entries_are_in_every_table_in_usual_units(result: ComparisonResult, snapshot: SnapshotAssertion) -> None:
@@ -136,7 +134,7 @@ def test_a_narrow_terminal_wraps_words_and_cuts_no_number(result: ComparisonResu
 
 
 def test_forty_columns_keep_the_cost_the_improvement_and_the_verdict(result: ComparisonResult) -> None:
-    text = on_terminal(print_result, result, width=40)
+    text = on_terminal(print_result, ComparisonView(result), width=40)
     heading = text[text.index("Entry") :].split("─")[0]
     assert heading.split() == ["Entry", "Cost", "Improvement", "Verdict"]
     left_out = "left out for want of room: 95 % interval, Position (mm), Heading (°);"
@@ -195,8 +193,11 @@ def test_a_terminal_shows_a_bar_for_all_runs_and_one_for_each_that_is_under_way(
 
 def calibration_lines(dataset: Dataset, *arguments: Any, **options: Any) -> list[str]:
     """What is printed of a data set and its calibration."""
-    calibrated = on_terminal(print_calibration, calibrate(dataset, *arguments, **options), width=160)
-    return (calibrated + on_terminal(print_inspection, inspect_dataset(dataset), width=160)).splitlines()
+    results: tuple[Result, ...] = (
+        CalibrationResult(calibrate(dataset, *arguments, **options)),
+        InspectionResult(inspect_dataset(dataset)),
+    )
+    return "".join(on_terminal(print_result, each, width=160) for each in results).splitlines()
 
 
 def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
@@ -210,35 +211,32 @@ def test_a_matrix_has_a_column_for_each_drive_signal() -> None:
 def test_a_calibration_shows_physical_parameters_then_the_matrix_on_a_screen_of_80_columns(robot: Robot) -> None:
     runs = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(5))
     run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), mount="fit")
-    lines = on_terminal(print_calibration, run, ["file", "verdict", "next", "COMMAND"], width=80).splitlines()
-    assert len(lines) <= 25 - 4
+    result = CalibrationResult(run, file=Path("c.yaml"))
+    lines = on_terminal(print_result, result, width=80).splitlines()
+    assert len(lines) <= 25 - 3 - 2 * len(run.warnings)  # the sentence with the command, and the warnings
     names = [each.name for each in run.parameters]
     assert [line.split()[0] for line in lines if line.split()[0] in names] == names
     first = next(number for number, line in enumerate(lines) if line.startswith("matrix"))
     assert first > max(number for number, line in enumerate(lines) if line.split()[0] in names)
-    in_tables = [line for line in lines if not line.startswith(("converged", "95 %", "noise"))]
-    assert max(map(len, in_tables)) <= 80
     shown = " ".join(" ".join(lines[first:]).split())
     elements = [f"{value:+.7f}" for value in run.calibration.matrix_array.ravel()]
-    assert all(each in shown for each in elements) or lines[first].startswith("matrix (3 x 8): not on this screen")
+    assert all(each in shown for each in elements) or re.match(r"matrix \(3 x \d\): not on this screen", lines[first])
 
 
 def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> None:
     runs = recorded(DIFFERENTIAL, 1.02 * DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
     run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
-    row = next(line for line in on_terminal(print_calibration, run).splitlines() if line.startswith("radius_left"))
+    row = next(
+        line
+        for line in on_terminal(print_result, CalibrationResult(run)).splitlines()
+        if line.startswith("radius_left")
+    )
     (radius,) = (each for each in run.parameters if each.name == "radius_left")
     interval = f"{radius.low:.5f} to {radius.high:.5f}"
     assert (
         " ".join(row.split())
         == f"radius_left 0.05000 {radius.value:.5f} m {radius.deviation_percent:+.2f} % {interval}"
     )
-
-
-def test_without_a_reading_the_matrix_is_shown_alone() -> None:
-    runs = recorded(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
-    run = replace(calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs)), parameters=())
-    assert on_terminal(print_calibration, run).startswith("diff map\nmatrix ")
 
 
 def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
@@ -252,11 +250,29 @@ def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> N
     robot = Robot(name="omni", wheels=tuple(wheels))
     assert 0 < abs(robot.inverse_kinematic_matrix[0, 0]) < 1e-15
     dataset = make_dataset("omni", robot, PERIOD, synthetic_trajectories(robot))
-    text = "\n".join(calibration_lines(dataset, "random_search", budget=Budget(evaluations=200)))
-    shares = re.findall(r"([+-][\d.]+) %\)", text)
-    assert len(shares) == 8
-    assert max(abs(float(share)) for share in shares) < 100
-    assert text.count("(design 0)") == 1
+    run = calibrate(dataset, "random_search", budget=Budget(evaluations=200))
+    shares = [cell.note for row in CalibrationResult(run).matrix_table().rows for cell in row.cells[1:]]
+    assert shares.count("design 0") == 1
+    assert all(abs(float(share.removesuffix(" %"))) < 100 for share in shares if share != "design 0")
+
+
+def test_without_a_reading_each_element_has_a_row_with_its_interval() -> None:
+    runs = recorded(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
+    bare = run.calibration.model_copy(update={"parameters": {}})
+    lines = on_terminal(print_result, CalibrationResult(replace(run, calibration=bare))).splitlines()
+    low, high = (run.to_frame()[end][0] for end in ("low", "high"))
+    assert f"{low:+.7f} to {high:+.7f}" in lines[2]
+
+
+@pytest.mark.parametrize(("terminal", "colour"), [(True, "\x1b[1;32mheld out"), (False, "held out")])
+def test_a_verdict_has_its_colour_on_a_terminal_and_none_in_a_pipe(terminal: bool, colour: str) -> None:
+    runs = recorded(DIFFERENTIAL, 1.02 * DIFFERENTIAL.inverse_kinematic_matrix, np.random.default_rng(5))
+    run = calibrate(make_dataset("diff", DIFFERENTIAL, RECORDED, runs))
+    better = HeldOutVerdict(verdict="better", sentence="held out: better than the design", detail="")
+    console = Console(file=StringIO(), force_terminal=terminal, color_system="standard" if terminal else None)
+    print_result(console, CalibrationResult(run, verdict=better, file=Path("c.yaml")))
+    assert f"\n{colour}" in console.file.getvalue()
 
 
 ALWAYS, NEVER = 0.0, 1e9  # s between two lines of a task that goes on

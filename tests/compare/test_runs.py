@@ -47,9 +47,9 @@ from report_page import on_terminal
 from timing import PATIENCE, until
 
 import omnibench as installed
-from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.config import CompareConfig, effective_config, load_calibrators, read_compare_config
 from omnibench.compare.plan import PlannedFit, load_robots, plan_fits, shared_code
+from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.run import run_comparison
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import DataError, OmnibenchError
@@ -62,6 +62,7 @@ from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Backend, ResultStore
 from omnibench.jobs.job_process import InPlace, Processes
 from omnibench.progress import Progress
+from omnibench.report.terminal import print_result
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
@@ -780,7 +781,9 @@ def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference() -> 
     first, *rest = result.runs
     other = replace(first, row=first.record.model_copy(update={"machine": "another"}))
     printed = " ".join(
-        on_terminal(print_result, replace(result, runs=(other, *rest)), width=200, everything=True).split()
+        on_terminal(
+            print_result, ComparisonView(replace(result, runs=(other, *rest)), everything=True), width=200
+        ).split()
     )
     assert "of the start)" in printed
     assert "on machines of different speed" in printed
@@ -789,6 +792,6 @@ def test_machines_that_differ_are_compared_by_the_ratio_to_their_reference() -> 
 def test_runs_that_are_not_timed_show_no_seconds(tmp_path: Path) -> None:
     result = compared_here(tmp_path, timing=False, calibrators=["theoretical"])
     assert {run["reference_seconds"] for run in summary(tmp_path)["runs"]} == {None}
-    printed = " ".join(on_terminal(print_result, result, width=200, everything=True).split())
+    printed = " ".join(on_terminal(print_result, ComparisonView(result, everything=True), width=200).split())
     assert "The runs were not timed." in printed
     assert " ms)" not in printed

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from report_page import on_terminal
 from report_samples import page, run, usual
 
-from omnibench.cli.terminal.comparison_tables import print_result
 from omnibench.compare.config import Bootstrap, CertificateChoice, CompareConfig, effective_config
 from omnibench.compare.plan import PlannedFit, load_robots, plan_fits
+from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredFit, SplitScore
 from omnibench.compare.score import SplitScorer, heading_error, position_error, score_fits
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics
@@ -28,6 +28,7 @@ from omnibench.fit.cost import Cost, SumOfNorms
 from omnibench.fit.evaluate import evaluate
 from omnibench.fit.intervals import Clusters
 from omnibench.registry import calibrators, costs, effects
+from omnibench.report.terminal import print_result
 from omnibench.robot.calibration import EffectTerm, ModelExtension, read_calibration
 from omnibench.robot.kinematics import Array, Robot, published_matrix
 from omnibench.robot.model import OdometryModel
@@ -504,7 +505,7 @@ def test_the_exact_optimum_has_little_to_gain_and_a_poor_search_much(result: Com
 
 
 def test_terminal_and_report_say_what_is_proven(result: ComparisonResult, tmp_path: Path) -> None:
-    assert "What no optimiser can beat" in on_terminal(print_result, result, width=200, everything=True)
+    assert "What no optimiser can beat" in on_terminal(print_result, ComparisonView(result, everything=True), width=200)
     text = page(result, tmp_path).text
     assert "What no optimiser can beat" in text
     assert "proven: ≤" in text

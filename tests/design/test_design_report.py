@@ -12,11 +12,11 @@ from report_samples import flower
 from sample_robots import APR02, LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
-from omnibench.cli.terminal.recording_tables import print_design
 from omnibench.design.candidates import DesignConfig, candidates_of_config, candidates_of_dataset
 from omnibench.design.design import Design, design_experiment
-from omnibench.design.report import design_document
+from omnibench.design.report import DesignResult, design_document
 from omnibench.report.render import write_document
+from omnibench.report.terminal import print_result, print_table
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 
@@ -47,7 +47,7 @@ def page(design: Design, folder: Path) -> Page:
 
 
 def printed(design: Design, width: int = 100) -> str:
-    return on_terminal(print_design, design, width=width)
+    return on_terminal(print_result, DesignResult(design), width=width)
 
 
 def plots(told: Page) -> list[dict[str, Any]]:
@@ -69,7 +69,8 @@ def test_report_and_terminal_read_as_before(design: Design, report: Page, snapsh
     assert report.words() == snapshot
     told = printed(design)
     assert NUMBER.sub("#", " ".join(told.split())) == snapshot
-    assert max(map(len, told.splitlines())) <= 100
+    for table in DesignResult(design).tables():
+        assert max(map(len, on_terminal(print_table, table, width=100).splitlines())) <= 100
     assert "…" not in told
 
 
@@ -94,7 +95,7 @@ def test_the_chosen_commands_stand_in_tables(design: Design, report: Page) -> No
 
 def test_plots_show_a_path_for_every_candidate_and_none_is_empty(design: Design, report: Page) -> None:
     drawn = plots(report)
-    assert len(drawn) == report.plots == 2 + 4 + 1
+    assert len(drawn) == report.plots == 2 + 2 + 1
     for found, flower_plot in zip(design.sets, drawn, strict=False):
         lines = [trace for trace in flower_plot["data"] if trace["mode"] == "lines"]
         assert len(lines) == len(found.commands)
@@ -117,7 +118,7 @@ def test_a_turn_on_the_spot_is_drawn_as_an_arc(tmp_path: Path) -> None:
 
 
 def test_axes_of_precision_are_logarithmic_and_their_labels_readable(report: Page) -> None:
-    for each in plots(report)[2:6]:
+    for each in plots(report)[2:4]:
         for axis in ("xaxis", "yaxis"):
             assert each["layout"][axis]["type"] == "log"
             assert not any("e+" in label for label in each["layout"][axis]["ticktext"])
@@ -127,7 +128,7 @@ def test_four_wheels_have_a_report_without_physical_parameters(tmp_path: Path) -
     config = flower(robot=LEVER_MECANUM, truth={"tolerances": {"radius": 0.02, "seed": 1}})
     dataset = simulate_dataset(FlowerConfig.model_validate(config)).dataset
     told = page(design_experiment(candidates_of_dataset(dataset)), tmp_path)
-    assert told.plots == 1 + 3 + 1
+    assert told.plots == 2 + 1 + 1
 
 
 def test_hostile_names_stay_words(tmp_path: Path) -> None:

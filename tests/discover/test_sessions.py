@@ -9,13 +9,14 @@ from hidden.session_sets import session_set
 from report_page import Page, on_terminal
 from shared_results import made_once
 
-from omnibench.cli.terminal.discovery_summary import print_discovery
 from omnibench.data.dataset import Dataset
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.report.discovery_report import discovery_report
+from omnibench.discover.report.discovery_result import DiscoveryResult
 from omnibench.discover.report.tables import VERDICTS, verdict_in_words
 from omnibench.discover.result import Discovery, discovery_document
 from omnibench.report.render import render
+from omnibench.report.terminal import print_result
 
 
 @made_once
@@ -29,7 +30,7 @@ def page(found: Discovery) -> Page:
 
 
 def printed(found: Discovery) -> str:
-    return on_terminal(print_discovery, found, Path("found"))
+    return on_terminal(print_result, DiscoveryResult(found, Path("found")))
 
 
 def test_nothing_is_not_said_to_be_missing_where_the_held_out_session_has_other_wheels() -> None:

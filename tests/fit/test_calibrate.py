@@ -18,7 +18,6 @@ from report_page import on_terminal
 from sample_robots import CAR, DIFFERENTIAL, TRICYCLE, WHEELED
 from wheeled_recordings import PERIOD, path, recorded
 
-from omnibench.cli.terminal.calibration_tables import print_calibration
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.storage import save_dataset
 from omnibench.environment import package_versions
@@ -31,6 +30,8 @@ from omnibench.fit.problem import Budget
 from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.progress import Progress
 from omnibench.registry import costs
+from omnibench.report.calibration_report import CalibrationResult
+from omnibench.report.terminal import print_result
 from omnibench.robot.calibration import read_calibration, write_calibration
 from omnibench.robot.kinematics import Array, Mount, Robot
 from omnibench.robot.model import OdometryModel
@@ -196,20 +197,20 @@ def test_an_empty_training_split_is_refused() -> None:
         calibrate(make_dataset("held out", ROBOT, 0.2, held_out))
 
 
-def test_intervals_that_hold_only_if_kept_values_are_right_are_marked_on_their_row() -> None:
-    told = on_terminal(print_calibration, calibrate(straight(), "closed_form"), width=160)
-    row = next(line for line in told.splitlines() if line.startswith("  95 %"))
-    assert row.count("*") == 3
-    assert "* only if the design values are right along a + b + c" in told
+def test_motions_that_keep_the_design_are_named_below_the_elements() -> None:
+    told = on_terminal(print_result, CalibrationResult(calibrate(straight(), "closed_form")), width=160)
+    assert "the design values are kept along a + b + c" in told
     for choices in ({"calibrator": "closed_form", "unidentified": "fit"}, {"calibrator": "map"}):
-        assert "*" not in on_terminal(print_calibration, calibrate(straight(), **choices))
+        assert "kept along" not in on_terminal(print_result, CalibrationResult(calibrate(straight(), **choices)))
 
 
 def test_an_angle_deviates_in_degrees(dataset: Dataset) -> None:
     run = calibrate(dataset)
     angle = next(each for each in run.parameters if each.name == "angle_a")
     row = next(
-        line for line in on_terminal(print_calibration, run, width=160).splitlines() if line.startswith("angle_a")
+        line
+        for line in on_terminal(print_result, CalibrationResult(run), width=160).splitlines()
+        if line.startswith("angle_a")
     )
     assert f" {math.degrees(angle.value - ROBOT.wheels[0].angle):+.3f} deg " in row
     assert "%" not in row

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from scipy.integrate import quad
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import chi
 
-from omnibench.cli.terminal.calibration_tables import print_certificate
 from omnibench.compare.config import read_compare_config
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.errors import ConfigError, DataError
@@ -34,6 +34,8 @@ from omnibench.fit.problem import CalibrationProblem
 from omnibench.fit.sum_of_norms import SolverError, least_step
 from omnibench.progress import Progress
 from omnibench.registry import Options, calibrators, costs
+from omnibench.report.certificate import CertificateResult
+from omnibench.report.terminal import print_result
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
@@ -576,7 +578,7 @@ def test_where_nothing_is_left_but_rounding_there_is_nothing_to_gain() -> None:
     assert run.result.cost < 1e-9
     certified = certify_optimum(run.calibration, dataset, parts=5)
     assert certified.certificate.gap == 0.0
-    told = on_terminal(print_certificate, certified, width=120)
+    told = on_terminal(print_result, CertificateResult(certified, Path("c.yaml")), width=120)
     assert "There is nothing to gain: what is left is rounding" in told
     assert "to gain on this calibration" not in told
 

@@ -149,9 +149,8 @@ BELOW = {
     "discover": {"robot", "data", "simulate", "fit", "report"},
     "live": {"robot", "data", "simulate"},
     "testing": {"robot", "data", "fit"},
-    "notebook": {"robot", "data", "slam", "simulate", "fit", "check", "report", "design", "compare", "discover"},
 }
-BELOW["cli"] = {*BELOW, "testing"} - {"notebook"}
+BELOW["cli"] = {*BELOW, "testing"}
 GROUND = {"config", "registry", "errors", "files", "processes", "jobs", "environment", "words", "progress", "views"}
 
 

@@ -1,5 +1,7 @@
 """Pages of a report: rendered blocks, their style, and figures as files."""
 
+import base64
+import gzip
 import json
 import math
 import re
@@ -13,14 +15,14 @@ import pytest
 from browser import chromium
 from hypothesis import given
 from hypothesis import strategies as st
-from report_page import Page
+from plotly.offline import get_plotlyjs
 
 from omnibench.errors import DataError
 from omnibench.report import blocks, numbers
 from omnibench.report.blocks import Choice, Details, Document, Figure, FigureGrid, LegendItem, Section
 from omnibench.report.figure_files import browser, named_grids, write_figures
 from omnibench.report.figures import area, arrows, coordinates, joined, line, marks, path
-from omnibench.report.render import Glossary, render, write_document
+from omnibench.report.render import render, write_document
 from omnibench.report.style import PALETTE, REFERENCE, THEORETICAL, colours, logarithmic, plan, plot, wrapped
 from omnibench.words import noun_for, plural
 
@@ -103,16 +105,28 @@ def test_the_file_loads_nothing_from_elsewhere() -> None:
     assert "default-src 'none'" in (policies[0] or "")
 
 
-def test_plotly_is_embedded_once_however_many_plots_there_are() -> None:
-    html = render(document(grid(), grid(), grid()))
-    assert len(re.findall(r"plotly\.js v\d", html)) == 1
+def library(*grids: blocks.FigureGrid) -> str:
+    """The script that a page with these figures draws them with."""
+    return gzip.decompress(base64.b64decode(Reader(render(document(*grids))).scripts["library"])).decode()
+
+
+def test_a_page_holds_once_what_draws_its_plots_and_no_more_than_it_needs() -> None:
+    assert len(re.findall(r"plotly\.js \(cartesian - minified\) v\d", library(grid(), grid()))) == 1
+    polar = blocks.FigureGrid((blocks.Figure("polar", go.Figure(go.Scatterpolar(r=[1], theta=[0])), "polar"),))
+    assert re.search(r"plotly\.js v\d", library(polar))
+    assert Reader(render(document(blocks.Paragraph("text")))).scripts.get("library", "").strip() == ""
+
+
+def test_the_bundle_is_that_of_the_installed_plotly() -> None:
+    drawn, whole = (re.search(r"v(\d+)\.\d+\.\d+", text)[1] for text in (library(grid())[:200], get_plotlyjs()[:200]))
+    assert drawn == whole
 
 
 def test_every_plot_has_data_of_its_own() -> None:
     reader = Reader(render(document(grid("a"), blocks.Details("more", (grid("b"),)))))
     wanted = [attrs["data-source"] for tag, attrs in reader.tags if tag == "div" and "data-source" in attrs]
     assert len(wanted) == len(set(wanted)) == 2
-    assert set(wanted) == set(reader.scripts)
+    assert set(wanted) == set(reader.scripts) - {"library"}
 
 
 def test_missing_values_of_a_plot_are_valid_json() -> None:
@@ -137,42 +151,6 @@ def test_a_report_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_a_written_report_is_what_was_rendered(tmp_path: Path) -> None:
     write_document(document(blocks.Paragraph("text")), tmp_path / "deep" / "report.html")
     assert (tmp_path / "deep" / "report.html").read_text(encoding="utf-8") == render(document(blocks.Paragraph("text")))
-
-
-def test_a_word_is_explained_where_it_first_occurs_and_only_there() -> None:
-    glossary = Glossary()
-    assert glossary.marked("the held-out error").startswith('the <dfn title="runs that the fit has not seen')
-    assert glossary.marked("held out again") == "held out again"
-    assert [word for word, _ in glossary.fresh()] == ["held out"]
-    assert glossary.fresh() == []
-
-
-def test_a_part_of_a_word_is_not_marked() -> None:
-    assert Glossary().marked("costly boxes, preference") == "costly boxes, preference"
-
-
-def test_hostile_words_stay_words() -> None:
-    marked = Glossary().marked("<b>cost</b> & <i>")
-    assert marked.startswith("&lt;b&gt;<dfn ")
-    assert marked.endswith("</dfn>&lt;/b&gt; &amp; &lt;i&gt;")
-
-
-def test_the_meanings_stand_below_the_section_that_first_uses_the_words() -> None:
-    sections = (
-        blocks.Section("a", "One", (blocks.Paragraph("The cost fell."),)),
-        blocks.Section("b", "Two", (blocks.Paragraph("The cost rose."),)),
-    )
-    html = render(blocks.Document("t", "s", sections))
-    assert html.count("<dfn ") == 1
-    told = Page(html).text
-    assert told.index("The cost fell.") < told.index("what a calibration makes small") < told.index("The cost rose.")
-
-
-def test_a_word_of_several_meanings_is_explained_where_it_has_the_one_that_is_listed() -> None:
-    glossary = Glossary()
-    assert "<dfn" not in glossary.marked("cannot fall below the bound; the weights of x and y")
-    glossary.marked("98 % of the bound that no design exceeds; weight of 95 %")
-    assert [word for word, _ in glossary.fresh()] == ["bound", "weight"]
 
 
 # Colours, axes and traces of plots, and numbers as a person reads them.

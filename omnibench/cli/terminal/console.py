@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.segment import Segment
 
+    from omnibench.report.result import Result
     from omnibench.robot.calibration import HeldOutVerdict
 
 _MOST_ALIKE = 3  # warnings that differ by places and numbers alone and are shown one by one
@@ -80,6 +81,23 @@ def print_json(document: Mapping[str, Any] | BaseModel) -> None:
     from omnibench.config import to_json
 
     typer.echo(to_json(document))
+
+
+def show(result: Result, as_json: bool = False) -> None:
+    """Print a result: its warnings, then its JSON document, or its tables, its remarks and what to do next."""
+    warn(dict.fromkeys(result.warnings))
+    if as_json:
+        return print_json(result.json())
+    from omnibench.report.terminal import print_result
+
+    print_result(make_console(), result)
+    return print_next(result)
+
+
+def print_next(result: Result) -> None:
+    """Print what came out and what to do next."""
+    step = result.next_step()
+    print_ending(step.outcome, step.then, *step.command)
 
 
 def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:

@@ -18,7 +18,6 @@ from rich.live import Live
 from rich.text import Text
 
 from omnibench.cli.terminal.progress_display import ProgressDisplay
-from omnibench.cli.terminal.tables import print_table, render_table
 from omnibench.errors import DataError, one_line
 from omnibench.live.estimation.health import anomalies_in_words
 from omnibench.live.network.presence import alive_robots, nothing_received
@@ -28,6 +27,9 @@ from omnibench.live.wire.recorder import Recorder
 from omnibench.live.wire.topics import TOPICS, KeySpace
 from omnibench.progress import Progress
 from omnibench.report.blocks import Column, Row, RowRole, Table
+from omnibench.report.numbers import fixed
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.report.terminal import render_table
 from omnibench.words import plural
 
 if TYPE_CHECKING:
@@ -63,56 +65,78 @@ def node_log(console: Console, warnings_only: bool = False) -> Iterator[logging.
         log.removeHandler(lines)
 
 
-def print_played(console: Console, report: PlayReport, simulated: bool) -> None:
-    """Print how much of a recording was played, and how long it took."""
-    sent = sum(report.sent.values())
-    if report.taken is None:
+class PlayedResult(Result):
+    """How much of a recording was played to a robot's node, and how long it took."""
+
+    def __init__(self, report: PlayReport, simulated: bool, robot: str) -> None:
+        self.report, self.simulated, self.robot = report, simulated, robot
+
+    def remarks(self) -> Sequence[Remark]:
+        report, sent = self.report, sum(self.report.sent.values())
         delivered = "delivery not confirmed, since no omnibench node runs the robot"
-    else:
-        count = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
-        again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
-        delivered = f"{count} taken by the node{again}"
-    console.print(
-        f"{plural(report.sent['joint_states'], 'wheel sample')} and {plural(report.sent['slam_pose'], 'SLAM pose')} "
-        f"({'simulated' if simulated else 'recorded'}), {report.data_seconds:.1f} s of the drive in "
-        f"{report.wall_seconds:.1f} s; {delivered}",
-        soft_wrap=True,
-    )
-    if not report.complete:
-        console.print(f"stopped after {sent} of {plural(report.total, 'message')}", soft_wrap=True)
+        if report.taken is not None:
+            count = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
+            again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
+            delivered = f"{count} taken by the node{again}"
+        messages = f"{plural(report.sent['joint_states'], 'wheel sample')} and "
+        messages += plural(report.sent["slam_pose"], "SLAM pose")
+        kind, seconds = "simulated" if self.simulated else "recorded", f"{report.data_seconds:.1f} s of the drive"
+        lines = [f"{messages} ({kind}), {seconds} in {report.wall_seconds:.1f} s; {delivered}"]
+        if not report.complete:
+            lines.append(f"stopped after {sent} of {plural(report.total, 'message')}")
+        if report.anomalies:
+            lines.append(f"meanwhile the node counted {anomalies_in_words(report.anomalies)}")
+        return list(map(Remark, lines))
+
+    def next_step(self) -> NextStep:
+        taken = self.report.taken is not None
+        heard = "all was taken by the node" if taken else "no omnibench node said that it took anything"
+        command = ("omnibench", "listen", self.robot)
+        return NextStep(f"the recording was played, and {heard}", "listen while it plays", command)
 
 
-def print_counted(console: Console, report: PlayReport) -> None:
-    """Print what the node could not use of what it took, or of what others sent it meanwhile."""
-    if report.anomalies:
-        console.print(f"meanwhile the node counted {anomalies_in_words(report.anomalies)}", soft_wrap=True)
+class DemonstrationResult(Result):
+    """What was played to a node, its errors against the reference, and its agreement with the batch odometry.
 
+    file: the node's config.
+    """
 
-def print_demonstration(console: Console, shown: Demonstration) -> None:
-    """Print what was played to a node, its errors against the reference, and its agreement with the batch odometry."""
-    print_played(console, shown.report, shown.simulated)
-    if shown.report.taken != sum(shown.report.sent.values()) or not shown.report.sent["joint_states"]:
-        return  # after a signal; what the node would have made of the rest is not known
-    estimates = (
-        ("odometry of the design matrix", shown.theoretical),
-        (f"odom: {shown.calibration}", shown.calibrated),
-        ("odometry/filtered: fused with SLAM", shown.fused),
-    )
-    rows = []
-    for label, errors in estimates:
-        if errors is not None:
-            figures = ((errors.position, 4), (math.degrees(errors.heading), 2), (errors.final_position, 4))
-            # NaN: nothing was compared yet
-            rows.append(Row.of(label, *("–" if math.isnan(value) else f"{value:.{n}f}" for value, n in figures)))
-    numeric = (Column("position, RMS", "m"), Column("heading, RMS", "deg"), Column("position at the end", "m"))
-    columns = (Column("estimate", numeric=False), *numeric)
-    print_table(console, Table(f"{shown.robot} against {shown.against}", columns, tuple(rows)))
-    console.print(
-        f"odom against the batch odometry: {shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost",
-        soft_wrap=True,
-    )
-    counts = {name: value for name, value in shown.health.counts.items() if value}
-    console.print("counted: " + ", ".join(f"{value} {name}" for name, value in counts.items()), soft_wrap=True)
+    def __init__(self, shown: Demonstration, file: Path) -> None:
+        self.shown, self.file = shown, file
+
+    def opening(self) -> Sequence[Remark]:
+        return PlayedResult(self.shown.report, self.shown.simulated, self.shown.robot).remarks()
+
+    @property
+    def _judged(self) -> bool:
+        """False after a signal: what the node would have made of the rest is not known."""
+        report = self.shown.report
+        return report.taken == sum(report.sent.values()) and bool(report.sent["joint_states"])
+
+    def tables(self) -> Sequence[Table]:
+        shown, rows = self.shown, []
+        for label, errors in (
+            ("odometry of the design matrix", shown.theoretical),
+            (f"odom: {shown.calibration}", shown.calibrated),
+            ("odometry/filtered: fused with SLAM", shown.fused),
+        ):
+            if errors is not None:
+                figures = ((errors.position, 4), (math.degrees(errors.heading), 2), (errors.final_position, 4))
+                rows.append(Row.of(label, *(fixed(value, decimals) for value, decimals in figures)))
+        numeric = (Column("position, RMS", "m"), Column("heading, RMS", "deg"), Column("position at the end", "m"))
+        columns = (Column("estimate", numeric=False), *numeric)
+        return [Table(f"{shown.robot} against {shown.against}", columns, tuple(rows))] if self._judged else []
+
+    def remarks(self) -> Sequence[Remark]:
+        if not self._judged:
+            return ()
+        counts = ", ".join(f"{value} {name}" for name, value in self.shown.health.counts.items() if value)
+        largest = f"{self.shown.batch_difference:.1e} (m, rad) at most; 0 messages of odom lost"
+        return [Remark(f"odom against the batch odometry: {largest}"), Remark(f"counted: {counts}")]
+
+    def next_step(self) -> NextStep:
+        command = ("omnibench", "live", self.file)
+        return NextStep("the node computed what the batch odometry computes", "run it for the robot", command)
 
 
 _PERIOD: Final = 0.25  # s between two updates of the line on a terminal; chosen

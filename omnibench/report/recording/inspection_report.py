@@ -1,14 +1,13 @@
-"""The report of an inspection: paths, motions driven, what can be identified, wheel rates, and runs step by step.
-
-Its tables are the terminal's, too. And the report of a check: the verdict, matched clocks in a picture, every finding
-with what to type.
-"""
+"""An inspection and a check as they are shown: motions driven, what can be identified, findings with what to type."""
 
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +23,121 @@ from omnibench.report.figures import line, marks
 from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, significant, typeset, with_unit
 from omnibench.report.recording.recording_figures import evenly
 from omnibench.report.recording.section import about_table, contents_table, path_overview, pictures
-from omnibench.report.style import INK, PALETTE, REFERENCE, plot
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.report.style import PALETTE, REFERENCE, plot
 from omnibench.robot.kinematics import Array, Robot
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
+
+
+class InspectionResult(Result):
+    """An inspection of a data set. sources: its folders, as they were typed."""
+
+    def __init__(self, inspection: Inspection, dataset: Dataset | None = None, sources: Sequence[Path] = ()) -> None:
+        self.inspection, self.dataset, self.sources = inspection, dataset, sources
+        self.warnings = inspection.warnings
+
+    def next_step(self) -> NextStep:
+        directions = self.inspection.identifiability.directions
+        named = self.sources[0] if len(self.sources) == 1 else self.inspection.dataset
+        if missing := [each.motion for each in directions if each.state != "driven" and each.motion]:
+            what = f"{named} hardly tells {' or '.join(missing)}"
+            return NextStep(what, "read what to drive", ("omnibench", "guide", "driving"))
+        told = f"{named} determines {'most' if self.inspection.identifiability.sentences else 'all'} of the matrix"
+        command = ("omnibench", "calibrate", *self.sources, "-o", "calibration.yaml")
+        return NextStep(told, "calibrate it", command)
+
+    def tables(self) -> Sequence[page.Table]:
+        return [recorded_table(self.inspection), split_table(self.inspection), identifiability_table(self.inspection)]
+
+    def remarks(self) -> Sequence[Remark]:
+        found = self.inspection
+        driven, shares = f"{found.driven_directions} of {len(found.driven_shares)}", found.driven_shares
+        lines = [f"directions of {driven_by(found)} driven: {driven} ({', '.join(f'{share:.2g}' for share in shares)})"]
+        lines += [f"noise: {found.identifiability.noise_source}", *(f"- {each}" for each in found.findings)]
+        return [Remark(text) for text in lines]
+
+    def document(self) -> page.Document:
+        assert self.dataset is not None
+        return inspection_document(self.dataset, self.inspection)
+
+    def json(self) -> Inspection:
+        return self.inspection
+
+
+class CheckResult(Result):
+    """A check of a recording. next_command: the command line for a recording that is ready."""
+
+    def __init__(self, checked: CheckReport, dataset: Dataset, next_command: str) -> None:
+        self.checked, self.dataset, self.next_command = checked, dataset, next_command
+
+    def next_step(self) -> NextStep:
+        checked, typed = self.checked, shlex.split(self.checked.command or self.next_command)
+        if checked.verdict == "ready":
+            then = "mend what it warns of" if checked.command else f"{typed[1]} it"
+            return NextStep("nothing stands in the way", then, tuple(typed))
+        if checked.command:
+            return NextStep("what can be mended is mended by one import", "type", tuple(typed))
+        if checked.verdict == "record more":
+            return NextStep("nothing of this can be typed", "record what is missing, and check again")
+        return NextStep("no option mends this", "correct what is named above, and check again")
+
+    def opening(self) -> Sequence[Remark]:
+        return [Remark(f"{self.checked.verdict.upper()}: {self.checked.sentence}.", _TONES[self.checked.verdict])]
+
+    def remarks(self) -> Sequence[Remark]:
+        checked, lines = self.checked, list[Remark]()
+        for finding in checked.findings:
+            lines.append(Remark(f"{finding.severity}: {finding.what} [{finding.where}]", _TONES[finding.severity]))
+            if finding.fix:
+                lines.append(Remark(f"  --set {finding.fix}" if finding.changes else f"  {finding.fix}"))
+        needed = {True: "a calibration is needed: ", False: "a calibration is hardly needed: ", None: ""}
+        return [*lines, *([Remark(f"{needed[checked.needed]}{checked.gain}")] if checked.gain else [])]
+
+    def document(self) -> page.Document:
+        return check_document(self.dataset, self.checked)
+
+    def json(self) -> dict[str, Any]:
+        return self.checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"})
+
+
+_TONES: dict[str, page.Tone] = {
+    "ready": "good", "fix": "bad", "record more": "warning", "error": "bad", "warning": "warning", "note": "plain",
+}  # fmt: skip
 
 
 def driven_by(inspection: Inspection) -> str:
     """What the columns of the matrix are: wheel rates, or drive signals."""
     return "wheel rates" if len(inspection.driven_shares) == len(inspection.wheels) else "drive signals"
+
+
+def recorded_table(inspection: Inspection) -> page.Table:
+    """Robot, samples, references and scans of a data set, with their intervals."""
+
+    def milliseconds(period: float | None) -> str:
+        return NOTHING if period is None else f"{1000 * period:.3g} ms"
+
+    shortest, longest = inspection.sample_period_range_s
+    every = f"{milliseconds(inspection.sample_period_s)} ({milliseconds(shortest)} to {milliseconds(longest)})"
+    rows = [page.Row.of("wheel samples", count(inspection.wheel_samples), every, ", ".join(inspection.wheels))]
+    if inspection.pose_period_s is not None:
+        poses = count(inspection.reference_poses)
+        rows.append(page.Row.of("reference poses", poses, milliseconds(inspection.pose_period_s), ""))
+    rows += [page.Row.of(f"references: {kind}", count(n), NOTHING, "") for kind, n in inspection.references.items()]
+    if (scans := inspection.scans) is not None:
+        view = (
+            f"{count(scans.rays)} rays over {math.degrees(scans.field_of_view_rad):.0f}° up to {scans.range_max_m:g} m"
+        )
+        seen = f"{view}, {scans.seen_share:.0%} measured; in {plural(scans.trajectories, 'run')}"
+        rows.append(page.Row.of("scans", count(scans.scans), milliseconds(scans.scan_period_s), seen))
+    columns = (
+        page.Column(f"robot {inspection.robot}", numeric=False),
+        page.Column("number"),
+        page.Column("every"),
+        page.Column("", numeric=False),
+    )
+    named = {"": inspection.description, "source: ": inspection.source, "licence: ": inspection.licence}
+    note = "; ".join(f"{name}{text}" for name, text in named.items() if text)
+    return page.Table(f"{inspection.dataset}: {kind_of_data(inspection.simulated)}", columns, tuple(rows), note)
 
 
 def split_table(inspection: Inspection) -> page.Table:
@@ -189,44 +295,30 @@ def _range(values: Array, decimals: int) -> str:
     return shown[0] if shown[0] == shown[1] else f"{shown[0]} to {shown[1]}"
 
 
-def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> page.FigureGrid:
-    """Velocities seen from above, and speeds against rates of turn, a dot for every half second."""
+def motion_figures(runs: Sequence[Trajectory], robot: Robot) -> tuple[list[page.Figure], tuple[page.LegendItem, ...]]:
+    """Speeds against rates of turn, a dot for every half second; with sideways motion also velocities from above."""
     twists, _ = _twists(runs, robot)
     twists = twists[evenly(len(twists), _DRAWN)] if len(twists) else twists
     kinds = motion_kinds(twists, robot)
     left, right = turning(kinds, "left"), turning(kinds, "right")
-    of_kinds = ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right))
-    groups = [(item, chosen) for item, chosen in of_kinds if chosen.any()]
-    above, beside = [], []
+    groups = [each for each in ((_LEFT, left), (_STRAIGHT_ON, ~left & ~right), (_RIGHT, right)) if each[1].any()]
+    beside, above = [], []
     for item, chosen in groups:
         ahead, aside, rate = twists[chosen].T
-        words = f"{item.label}<br>%{{y:.2f}} m/s ahead, %{{x:.2f}} m/s to the left"
-        above.append(marks(item, 5, aside, ahead, hover=words, marker_opacity=0.6))
-        speeds, degrees = np.hypot(ahead, aside), np.degrees(rate)
-        beside.append(marks(item, 5, degrees, speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
-    middle = marks(page.LegendItem("", "", INK, symbol="cross-thin-open"), 10, [0.0], [0.0])
-    velocity = plot(*above, middle, x_title="to the left (m/s)", y_title="ahead (m/s)")
-    reach = 1.1 * max(float(np.abs(twists[:, :2]).max(initial=0.0)), 0.01)
-    velocity.update_layout(
-        xaxis={"range": [reach, -reach], "scaleanchor": "y"}, yaxis={"range": [-reach, reach], "scaleratio": 1}
-    )
+        velocity = f"{item.label}<br>%{{y:.2f}} m/s ahead, %{{x:.2f}} m/s to the left"
+        above.append(marks(item, 5, aside, ahead, hover=velocity, marker_opacity=0.6))
+        speeds = np.hypot(ahead, aside)
+        beside.append(marks(item, 5, np.degrees(rate), speeds, hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6))
     rates = plot(*beside, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
-    rates.update_xaxes(autorange="reversed")
-    rates.update_yaxes(rangemode="tozero")
-    return page.FigureGrid(
-        (
-            page.Figure(
-                "Velocities, seen from above", velocity, "Velocity ahead against velocity to the left, m/s", 360
-            ),
-            page.Figure(
-                "Speeds and rates of turn", rates, "Speed in m/s against the rate of turn in degrees a second", 360
-            ),
-        ),
-        tuple(item for item, _ in groups),
-        2,
-        "A dot is half a second, by the design values.",
-        "motions-driven",
-    )
+    rates.update_xaxes(autorange="reversed").update_yaxes(rangemode="tozero")
+    title = "Speeds and rates of turn, a dot for every half second"
+    figures = [page.Figure(title, rates, "Speed in m/s against the rate of turn in °/s", 340)]
+    if any(name.startswith("sideways") for name in kinds):
+        seen = plot(*above, x_title="to the left (m/s)", y_title="ahead (m/s)")
+        seen.update_layout(xaxis={"autorange": "reversed", "scaleanchor": "y"}, yaxis={"scaleratio": 1})
+        title = "Velocities, seen from above"
+        figures.append(page.Figure(title, seen, "Velocity ahead against velocity to the left, m/s", 340))
+    return figures, tuple(item for item, _ in groups)
 
 
 def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Document:
@@ -234,24 +326,28 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Docume
     training = dataset.split("train") or dataset.trajectories
     motions = driven_motions(training, dataset.robot)
     identified = inspection.identifiability
+    figures, items = motion_figures(training, dataset.robot)
+    picture = path_overview(dataset)
+    if len(picture.figures) == 1:  # beside the paths there is room for the speeds
+        both, words = (*picture.figures, figures.pop(0)), f"{picture.caption} Speeds by the design values."
+        picture = page.FigureGrid(both, (*picture.legend, *items), 2, words, picture.name)
     return page.Document(
         title=f"What is in {dataset.name}",
         subtitle=dataset.description,
         sections=(
-            _answer(dataset, inspection, motions),
+            _answer(inspection, motions, picture),
             page.Section(
                 "motions",
                 "Motions driven",
-                (motion_figures(training, dataset.robot), motion_table(motions)),
+                (*((page.FigureGrid(tuple(figures), items),) if figures else ()), motion_table(motions)),
                 about="By the training runs, from which a calibration is fitted.",
             ),
             page.Section(
                 "identified",
                 "What can be identified",
                 (
-                    *map(page.Paragraph, _identified_in_words(inspection)),
-                    identifiability_table(inspection),
                     *((parameter_table(inspection),) if identified.parameters else ()),
+                    identifiability_table(inspection),
                     page.Paragraph(f"Noise: {identified.noise_source}.", "note"),
                 ),
                 about="What a calibration from these runs could know, and what it could not.",
@@ -262,24 +358,24 @@ def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Docume
                 "What was recorded",
                 (split_table(inspection), contents_table(dataset), about_table(dataset)),
                 about="Quantities, numbers, intervals, and where the recordings come from.",
-                folded=True,
             ),
         ),
         badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion]) -> page.Section:
-    splits = inspection.splits
-    names = {"train": "to train", "validation": "held out"}
-    parts = " and ".join(f"{of_split.trajectories:,} {names[name]}" for name, of_split in splits.items())
+def _answer(inspection: Inspection, motions: list[DrivenMotion], picture: page.FigureGrid) -> page.Section:
+    splits, open_ones = inspection.splits, inspection.identifiability.sentences
     missing = missing_in_words(motions)
-    lacks = f"To train, it was never driven {missing}." if missing else "Every kind of motion was driven to train."
-    open_ones = inspection.identifiability.sentences
-    told = "Part of the matrix stays open: see below." if open_ones else "The runs determine all of the matrix."
-    sentence = f"{plural(inspection.trajectories, 'run')} of {inspection.robot} ({parts}). {lacks} {told}"
-    seconds = sum(of_split.duration_s for of_split in splits.values())
-    metres = sum(of_split.distance_m for of_split in splits.values())
+    lacks = f"Not driven to train: {missing}." if missing else "Every kind of motion was driven to train."
+    told = "Part of the matrix stays open." if open_ones else "The runs determine all of the matrix."
+    metres, seconds = (sum(getattr(each, name) for each in splits.values()) for name in ("distance_m", "duration_s"))
+    parts = ", ".join(f"{of_split.trajectories:,} {name}" for name, of_split in splits.items())
+    kinds = ", ".join(f"{number} of {kind}" for kind, number in inspection.references.items())
+    poses = page.Fact("References", count(sum(inspection.references.values())), kinds)
+    if inspection.pose_period_s is not None:
+        every, beside = f"every {significant(1e3 * inspection.pose_period_s)} ms", f"; {kinds}" if kinds else ""
+        poses = page.Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
     tiles = (
         page.Fact("Runs", count(inspection.trajectories), parts),
         page.Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(seconds / 60, 1)} min"),
@@ -288,36 +384,15 @@ def _answer(dataset: Dataset, inspection: Inspection, motions: list[DrivenMotion
             f"every {significant(1e3 * inspection.sample_period_s)} ms",
             count(inspection.wheel_samples),
         ),
-        _reference_tile(inspection),
+        poses,
     )
     return page.answer_section(
-        sentence,
+        f"{plural(inspection.trajectories, 'run')} of {inspection.robot}. {lacks} {told}",
         tiles,
-        path_overview(dataset),
+        picture,
         page.Callout("Findings", inspection.findings, "warning" if open_ones else "plain"),
         page.Callout("Warnings on reading the data", inspection.warnings, "warning"),
     )
-
-
-def _reference_tile(inspection: Inspection) -> page.Fact:
-    """The reference poses or, where there are none, how many references of which kinds there are."""
-    kinds = ", ".join(f"{number} of {kind}" for kind, number in inspection.references.items())
-    if inspection.pose_period_s is None:
-        return page.Fact("References", count(sum(inspection.references.values())), kinds)
-    every = f"every {significant(1e3 * inspection.pose_period_s)} ms"
-    beside = f"; beside them {kinds}" if kinds else ""
-    return page.Fact("Reference poses", every, f"{count(inspection.reference_poses)}{beside}")
-
-
-def _identified_in_words(inspection: Inspection) -> list[str]:
-    """What the runs determine and what they do not, a sentence each."""
-    driven = [each for each in inspection.identifiability.directions if each.state == "driven" and each.motion]
-    words = []
-    for title, wanted in (("Determined", False), ("Determined in part", True)):
-        some = [each for each in driven if wanted == any(value > UNTOLD for value in each.deviations or ())]
-        motions = list(dict.fromkeys(each.motion.removesuffix(" on the spot") for each in some))
-        words += [f"{title}: the columns of the matrix that belong to {listing(motions)}."] if some else []
-    return [*words, *(f"{sentence[:1].upper()}{sentence[1:]}." for sentence in inspection.identifiability.sentences)]
 
 
 _WHEELS = page.LegendItem("wheels", "by the wheels, at the design", PALETTE[0])
@@ -325,7 +400,6 @@ _REFERENCE = page.LegendItem("reference", "by the reference", REFERENCE)
 _SMOOTH = 0.3  # s over which rates of turn are taken, so that the reference's noise does not hide them; chosen
 _SHOWN = 12.0  # s that are drawn, where matching shows best; chosen
 _LOOKED_AT = 8  # runs whose clocks are farthest off, of which the one is drawn that shows it best; chosen
-_WORDS = {"error": "Errors", "warning": "Warnings", "note": "Notes"}
 
 
 def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
@@ -333,44 +407,30 @@ def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
     runs = [run for run in dataset.trajectories if run.has_poses]
     clocks_are_off = any(finding.kind in CLOCKS for finding in checked.findings)
     picture = _clock_picture(dataset.robot, runs, checked.clocks) if clocks_are_off else None
-    counts = {severity: sum(each.severity == severity for each in checked.findings) for severity in _WORDS}
-    tiles = [page.Fact(_WORDS[severity], str(count)) for severity, count in counts.items()]
-    tiles.append(page.Fact("Runs", str(len(dataset.trajectories))))
-    gain = f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
-    sections = [
-        page.answer_section(
-            f"{checked.sentence}.",
-            tiles,
-            picture or path_overview(dataset),
-            *([page.Paragraph(gain, "note")] if checked.gain else []),
-            title="Verdict",
-        ),
-        page.Section("findings", "Findings, each with what to type", tuple(_blocks(checked))),
+    tiles = [
+        page.Fact(f"{severity.capitalize()}s", str(sum(each.severity == severity for each in checked.findings)))
+        for severity in ("error", "warning", "note")
     ]
-    return page.Document(
-        title=f"Check: {dataset.name}",
-        subtitle=dataset.description,
-        sections=tuple(sections),
-        badges=page.simulated_badge(dataset.simulated),
+    tiles.append(page.Fact("Runs", str(len(dataset.trajectories))))
+    columns = tuple(page.Column(name, numeric=False) for name in ("", "finding", "where", "what to type or do"))
+    rows = tuple(
+        page.Row.of(
+            each.severity, each.what, each.where, f"--set {each.fix}" if each.changes and each.fix else each.fix
+        )
+        for each in checked.findings
     )
-
-
-def _blocks(checked: CheckReport) -> list[page.Block]:
-    if not checked.findings:
-        return [page.Paragraph("Nothing was found that spoils a calibration.")]
-    blocks: list[page.Block] = []
-    for finding in checked.findings:
-        end = "" if finding.what.endswith("?") else "."
-        blocks.append(page.Paragraph(f"{finding.severity.capitalize()}, {finding.where}: {finding.what}{end}"))
-        if finding.changes and finding.fix:
-            blocks.append(page.Code(f"--set {finding.fix}"))
-        elif finding.fix.startswith("omnibench "):
-            blocks.append(page.Code(finding.fix))
-        elif finding.fix:
-            blocks.append(page.Paragraph(finding.fix, "note"))
-    if checked.command:
-        blocks += [page.Paragraph("One import mends what options mend:"), page.Code(checked.command)]
-    return blocks
+    gain = f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
+    answer = page.answer_section(
+        f"{checked.sentence}.",
+        tiles,
+        picture or path_overview(dataset),
+        *([page.Table("Findings, each with what to type", columns, rows)] if rows else []),
+        *([page.Code(checked.command, "One import mends what options mend")] if checked.command else []),
+        *([page.Paragraph(gain, "note")] if checked.gain else []),
+        title="Verdict",
+    )
+    badges = page.simulated_badge(dataset.simulated)
+    return page.Document(f"Check: {dataset.name}", dataset.description, (answer,), badges)
 
 
 def _clock_picture(

@@ -2,6 +2,7 @@
 
 // One plot after the other, so that the page can be read and scrolled while they are drawn; folded ones last.
 async function drawPlots() {
+  await loadLibrary();
   const folded = (canvas) => Number(canvas.closest("details:not([open])") !== null);
   for (const canvas of [...document.querySelectorAll(".canvas")].sort((a, b) => folded(a) - folded(b))) {
     const { data, layout } = JSON.parse(document.getElementById(canvas.dataset.source).textContent);

@@ -111,7 +111,7 @@ def test_an_unknown_table_or_option_of_a_plot_is_refused_with_the_nearest() -> N
 
 @pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, CAR, SWERVE], ids=lambda robot: robot.name)
 def test_every_kind_of_robot_is_drawn_and_described(robot: Robot) -> None:
-    assert len(repr(robot).splitlines()) == len(robot.wheels) + 1
+    assert all(wheel.name in repr(robot) for wheel in robot.wheels)
     assert len(robot.plot().data) > 0
 
 
@@ -125,8 +125,8 @@ def test_an_evaluation_of_runs_without_poses_shows_the_errors_that_there_are() -
     recorded = result("dataset")
     dataset = replace(recorded, trajectories=tuple(map(with_a_tape, recorded.trajectories)))
     evaluation = omnibench.evaluate(omnibench.calibrate(dataset).calibration, dataset)
-    assert "mean position error" in repr(evaluation)
-    assert "heading error" not in repr(evaluation)
+    assert "distance" in repr(evaluation)
+    assert evaluation.splits["train"].heading_mean_rad is None
     assert evaluation.to_frame("references")["kind"].unique().to_list() == ["distance"]
     assert len(evaluation.plot().data) == 2
 

@@ -1,0 +1,129 @@
+"""A comparison as it shows itself: on a terminal, in its report, in a notebook and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import plotly.graph_objects as go
+import polars as pl
+
+from omnibench.compare.output import calibration_file, result_table, summary
+from omnibench.compare.report.answer import answer_sentence, entry_chart
+from omnibench.compare.report.document import comparison_document
+from omnibench.compare.report.robots import cells_table, methods_table, robots_answer, robots_sentence
+from omnibench.compare.report.tables import (
+    answer_table,
+    certificate_table,
+    cost_table,
+    entry_table,
+    final_error_table,
+    run_table,
+)
+from omnibench.compare.report.view import views
+from omnibench.compare.result import ComparisonResult
+from omnibench.errors import DataError, require_choice
+from omnibench.report.blocks import Document, FigureGrid, Table, Tone
+from omnibench.report.calibration_report import how_to_use
+from omnibench.report.figures import drawn
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.robot.calibration import read_calibration
+from omnibench.words import plural
+
+_SHOWN = 3  # failures that are listed; the others are counted (chosen)
+_TONES: Mapping[str, Tone] = {"better": "good", "worse": "bad"}  # by verdict; the others are warnings
+
+
+class ComparisonView(Result):
+    """The answer in a table; with ``everything`` all tables of the report and all failures."""
+
+    def __init__(self, result: ComparisonResult, *, everything: bool = False) -> None:
+        self.result, self.everything = result, everything
+        runs, sets = plural(len(result.runs), "run"), ", ".join(result.datasets)
+        self.title = f"Comparison {result.config.name!r}: {runs} on {sets}, in {result.output}"
+        self.warnings = result.warnings
+
+    def sentence(self) -> str:
+        if self.result.config.robots:
+            return robots_sentence(self.result)
+        return "; ".join(answer_sentence(view) for view in views(self.result))
+
+    def next_step(self) -> NextStep:
+        result, report = self.result, f"read {self.result.output / 'report.html'}"
+        if result.nothing_answered:
+            first = result.failures[0] if result.failures else "no method is for these robots"
+            what = "no method gave an answer" if result.config.robots else "every search failed"
+            return NextStep(f"{what}, the first: {first}", "mend what its reason names, and run again")
+        if result.broken:
+            ending = f"{plural(len(result.broken), 'robot')} left out, whose recordings cannot be read"
+            return NextStep(ending, "say where they are with --data, or take them out of the config, and run again")
+        if result.config.robots:
+            return NextStep(robots_sentence(result).rstrip("."), report)
+        compared = f"{plural(len({run.fit.label for run in result.runs}), 'entry')} compared"
+        name, best = next(iter(result.held_out.items()), ("", None))
+        file = None if best is None else calibration_file(result, name, best.label)
+        if best is None or file is None:
+            return NextStep(f"{compared} in {result.output}", "read report.html in that folder")
+        if best.verdict.verdict == "better":
+            outcome = f"{compared}; the best on {name}, {best.label}, beats the design on runs held out"
+            return NextStep(outcome, *how_to_use(read_calibration(file), file))
+        unsure = f"{compared}; that the best on {name}, {best.label}, beats the design was not shown by runs held out"
+        return NextStep(unsure, f"{report} and record more runs for validation")
+
+    def tables(self) -> Sequence[Table]:
+        if self.result.config.robots:
+            return [*([cells_table(self.result)] if self.everything else []), methods_table(self.result)]
+        tables: list[Table] = []
+        for view in views(self.result):
+            tables.append(answer_table(view))
+            if self.everything:
+                tables += [make(view, split) for make in (cost_table, final_error_table) for split in view.splits]
+                tables += [entry_table(view), *certificate_table(view), run_table(view)]
+        return tables
+
+    def remarks(self) -> Sequence[Remark]:
+        return list(self._remarks())
+
+    def _remarks(self) -> Iterator[Remark]:
+        result = self.result
+        for name, reason in result.broken.items():
+            yield Remark(f"cannot be read: {name}: {reason}", "warning")
+        shown = len(result.failures) if self.everything else _SHOWN
+        for failure in result.failures[:shown]:
+            yield Remark(f"no answer: {failure}", "warning")
+        if len(result.failures) > shown:
+            yield Remark(f"no answer: {len(result.failures) - shown} more; --all lists them", "warning")
+        for name, entry in result.held_out.items():
+            tone = _TONES.get(entry.verdict.verdict, "warning")
+            yield Remark(f"{name}, {entry.label}: {entry.verdict.sentence}", tone)
+            yield from (Remark(sentence, "warning") for sentence in result.sessions.get(name, ()))
+        yield Remark(f"report: {result.output / 'report.html'}")
+
+    def document(self) -> Document:
+        return comparison_document(self.result)
+
+    def json(self) -> Mapping[str, Any]:
+        return summary(self.result)
+
+    def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        names = ("study",) if self.result.config.robots else ("statistics", "runs", "errors", "history", "study")
+        return {name: partial(result_table, self.result, name) for name in names}
+
+    def figure(self, dataset: str | None = None) -> go.Figure:
+        """The cost of every entry with its 95 % interval. dataset: the name of one, if there are several.
+
+        Of several robots: the reference method beside the best published one, cell by cell.
+        """
+        if self.result.config.robots:
+            grids = [block for block in robots_answer(self.result).blocks if isinstance(block, FigureGrid)]
+            if not grids:
+                raise DataError("no method is compared with published ones: there is nothing to draw")
+            return drawn(grids[0])
+        of_sets = {view.name: view for view in views(self.result)}
+        name = next(iter(of_sets)) if dataset is None else dataset
+        require_choice("data set", name, of_sets)
+        grid = entry_chart(of_sets[name])
+        if grid is None:
+            raise DataError(f"{name}: no entry was calibrated, so that there is nothing to draw")
+        return drawn(grid)

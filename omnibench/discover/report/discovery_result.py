@@ -1,0 +1,140 @@
+"""A discovery as it is shown on a terminal, in a notebook and at a prompt; its page is that of discovery_report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from omnibench.discover.output import residual_table
+from omnibench.discover.report import tables
+from omnibench.discover.report.evidence_figures import gap_grid
+from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
+from omnibench.report.blocks import Cell, FigureGrid, Table, Tone
+from omnibench.report.numbers import listing
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.words import plural
+
+# So much is shown that the answer fits into a screen; the report has the rest.
+_HIDDEN = 4  # lines of effects that could still hide
+_MOST_DEPENDENCES = 4  # lines of covariates that the residuals depend on
+_PARAMETERS = 9  # lines for an effect
+_LINES = 3  # notes, and as many warnings
+_COLUMNS = {
+    **dict.fromkeys(("effect", "stage"), pl.String),
+    "weight": pl.Float64,
+    "parameter": pl.String,
+    "value": pl.Float64,
+    "unit": pl.String,
+    **dict.fromkeys(("low", "high"), pl.Float64),
+}
+
+
+class DiscoveryResult(Result):
+    """A discovery: its verdict, the effects, the errors before and after. folder: where its files are."""
+
+    def __init__(self, discovery: Discovery, folder: Path | None = None) -> None:
+        self.discovery, self.folder = discovery, folder
+        self.title = f"Discovery on {tables.data_in_words(discovery)}"
+        self.warnings = discovery.dataset.warnings
+
+    def sentence(self) -> str:
+        verdict = tables.verdict_in_words(self.discovery)
+        return f"verdict: {self.discovery.verdict} ({verdict}). {self.discovery.headline}"
+
+    def opening(self) -> Sequence[Remark]:
+        discovery = self.discovery
+        verdict = f"verdict: {discovery.verdict} ({tables.verdict_in_words(discovery)})"
+        tone: Tone = "good" if discovery.verdict in ("named", "none") else "warning"
+        return [Remark(tables.data_in_words(discovery)), Remark(verdict, tone), Remark(discovery.headline)]
+
+    def next_step(self) -> NextStep:
+        discovery, folder = self.discovery, self.folder or Path()
+        if any(experiment.runs for experiment in discovery.experiments):
+            drive = "drive the runs above, import them with --set train=*, join both recordings and discover again"
+            join = ("omnibench", "import", "dataset", "RECORDED", "--set", "join=NEW", "-o", "BOTH")
+            return NextStep("more than one effect explains these data", drive, join)
+        kind, to = ("extended", "c_header") if discovery.extends else ("plain", "ros2_controllers")
+        command = ("omnibench", "export", folder / CALIBRATION_FILES[kind], "--to", to)
+        if discovery.extends:
+            return NextStep("the extended calibration holds what the matrix lacked", "use it on the robot", command)
+        return NextStep("nothing was added to the matrix", "use the plain calibration", command)
+
+    def tables(self) -> Sequence[Table]:
+        return [_in_brief(table) for table in self._tables()]
+
+    def _tables(self) -> Iterator[Table]:
+        discovery = self.discovery
+        if discovery.effects:
+            effects = [replace(effect, parameters=effect.parameters[:_PARAMETERS]) for effect in discovery.effects]
+            yield tables.parameter_table(effects, discovery.dataset)
+        if discovery.where:
+            strongest = {found.covariate: found for found in reversed(discovery.where)}  # the first of each covariate
+            shown = [found for found in discovery.where if strongest[found.covariate] is found][:_MOST_DEPENDENCES]
+            yield tables.dependence_table(shown, "Where the plain matrix fails")
+        yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
+        if discovery.hidden:
+            yield tables.hidden_table(tables.worst_of_each(discovery.hidden)[:_HIDDEN])
+        yield from (tables.experiment_table(each) for each in discovery.experiments if each.commands)
+
+    def remarks(self) -> Sequence[Remark]:
+        return [Remark(line) for line in self._remarks()]
+
+    def _remarks(self) -> Iterator[str]:
+        discovery = self.discovery
+        for experiment in discovery.experiments:
+            yield experiment.description
+        for effect in discovery.effects:
+            if effect.in_doubt:
+                yield f"In doubt: {effect.name}: {effect.in_doubt}."
+        if discovery.left:
+            left = dict.fromkeys(f"{each.covariate} ({tables.chance(each.p_value)})" for each in discovery.left)
+            yield f"Left over: the residuals still depend on {listing(list(left))}."
+        if discovery.classes:
+            yield f"These data cannot tell apart: {'; '.join(' or '.join(names) for names in discovery.classes)}."
+        if discovery.absorbed:
+            absorbed = listing(list(discovery.absorbed), 12)
+            yield f"Absorbed by any matrix, and so never named: {absorbed}."
+        new_motions = tables.extrapolations_in_words(discovery.extrapolations)
+        for lines, head in ((new_motions, "warning: not driven in training: "), (discovery.notes, "- ")):
+            yield from (f"{head}{line}" for line in lines[:_LINES])
+            if len(lines) > _LINES:
+                yield f"{plural(len(lines) - _LINES, 'more remark')} in the report"
+        if self.folder is not None:
+            kind = "extended" if discovery.extends else "plain"
+            what = "extended calibration" if discovery.extends else "plain calibration, as nothing was added"
+            yield f"{what}: {self.folder / CALIBRATION_FILES[kind]}"
+            for number, experiment in enumerate(discovery.experiments, 1):
+                if experiment.config:
+                    yield f"the runs to drive, as a config: {self.folder / experiment_file(number)}"
+            yield f"report: {self.folder / 'report.html'}"
+
+    def figures(self) -> Sequence[FigureGrid]:
+        return [gap_grid(self.discovery)]
+
+    def json(self) -> Mapping[str, Any]:
+        return discovery_document(self.discovery, self.folder or Path())
+
+    def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
+        return {"effects": self._effects, "residuals": lambda: residual_table(self.discovery)}
+
+    def _effects(self) -> pl.DataFrame:
+        rows = [
+            (effect.name, effect.stage, effect.weight, each.name, each.value, each.unit, each.low, each.high)
+            for effect in self.discovery.effects
+            for each in effect.parameters
+        ]
+        return pl.DataFrame(rows, _COLUMNS, orient="row")
+
+
+def _in_brief(table: Table) -> Table:
+    """A table without notes and lesser columns."""
+    shown = [index for index, column in enumerate(table.columns) if column.priority == 0]
+    rows = (
+        row if row.role == "group" else replace(row, cells=tuple(Cell(row.cells[index].text) for index in shown))
+        for row in table.rows
+    )
+    return Table(table.caption, tuple(table.columns[index] for index in shown), tuple(rows))

@@ -1,1 +1,0 @@
-"""What public objects show in a notebook: texts, data frames and figures."""
