@@ -1,7 +1,6 @@
 """SciPy's dual annealing: Xiang et al., Physics Letters A 233:216 (1997)."""
 
 from numpy.random import Generator
-from scipy.optimize import dual_annealing
 
 from omnibench.fit.library_search import LibrarySearch, UnitCost
 from omnibench.registry import calibrators
@@ -16,5 +15,7 @@ class DualAnnealing(LibrarySearch):
 
     def search(self, cost: UnitCost, start: Array, rng: Generator) -> str:
         """SciPy calls a function of one point."""
+        from scipy.optimize import dual_annealing
+
         box = [(0.0, 1.0)] * len(start)
         return dual_annealing(lambda point: float(cost(point)[0]), box, x0=start, rng=rng).message[0]

@@ -444,3 +444,44 @@ def test_a_disk_that_is_full_after_the_runs_loses_none(tmp_path: Path) -> None:
         assert not (results / file).exists()
         assert not list(results.rglob(".*"))
         assert len(list((results / "runs").glob("*.json"))) == 3
+
+
+def test_a_strangers_method_is_compared_and_the_fits_of_the_others_are_kept_for_the_next(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    body = """
+class Mine(Calibrator):
+    '''Starts and stays.'''
+    stochastic = False
+    def calibrate(self, problem):
+        return Solution(problem.start, "{word}")
+calibrators.register("mine")(Mine)
+"""
+    config = write_config(tmp_path)
+    for word, new in (("stays", 4), ("remains", 1)):
+        folder = write_plugin(tmp_path / word, "mine", body.format(word=word))
+        with registries_restored():
+            run = command("compare", config, "--add", folder / "mine.py", "-o", tmp_path / f"out-{word}")
+        assert run.returncode == 0, run.stderr
+        fitted = [line for line in run.stderr.splitlines() if line.startswith("[") and "kept" not in line]
+        assert len(fitted) == new
+        assert summary(tmp_path / f"out-{word}")["runs"][-1]["reason"] == word
+    none = write_plugin(tmp_path / "none", "none", "VALUE = 1")
+    refusal = command("compare", config, "--add", none / "none.py")
+    assert refusal.returncode == 2
+    assert "registers no calibrator" in refusal.stderr
+
+
+def test_the_courses_of_searches_are_written_as_iohinspector_reads_them(command: Command, tmp_path: Path) -> None:
+    run = command("compare", write_config(tmp_path), "-o", tmp_path / "out", "--traces", tmp_path / "traces")
+    assert run.returncode == 0, run.stderr
+    (file,) = (tmp_path / "traces" / "flower" / "search").glob("*.json")
+    head = json.loads(file.read_text())
+    (scenario,) = head["scenarios"]
+    (searched,) = (each for each in summary(tmp_path / "out")["runs"] if each["label"] == "search")
+    assert scenario["dimension"] == 9
+    assert scenario["runs"][0]["evals"] == searched["evaluations"]
+    first, *rows = (file.parent / scenario["path"]).read_text().splitlines()
+    assert first == "evaluations raw_y"
+    assert float(rows[-1].split()[1]) == pytest.approx(searched["train_cost"], rel=1e-12)
