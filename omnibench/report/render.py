@@ -7,7 +7,6 @@ version that plotly.py is made for), which is a third of the whole; a page holds
 from __future__ import annotations
 
 import base64
-import gzip
 import html
 import json
 import re
@@ -21,7 +20,6 @@ from typing import Any
 from jinja2 import Environment as Templates
 from jinja2 import PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
-from plotly.offline import get_plotlyjs
 from pydantic import BaseModel
 
 from omnibench.config import to_yaml
@@ -62,7 +60,9 @@ def render(document: Document) -> str:
     footer = f"omnibench {package_versions().get('omnibench', '')}, written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     grids = [grid for _, grid in grids_of(document)]
     template = _templates().get_template("report.html.j2")
-    return template.render(document=document, plot_options=_json(_PLOT_OPTIONS), footer=footer, library=_library(grids))
+    return template.render(
+        document=document, plot_options=_json(_PLOT_OPTIONS), footer=footer, library=_library() if grids else ""
+    )
 
 
 def fragment(blocks: Sequence[Block]) -> str:
@@ -83,8 +83,7 @@ def figures_page(grids: Mapping[str, FigureGrid]) -> str:
         }
         for name, grid in grids.items()
     ]
-    library = _library(list(grids.values()))
-    return _templates().get_template("figures.html.j2").render(grids=described, library=library)
+    return _templates().get_template("figures.html.j2").render(grids=described, library=_library() if grids else "")
 
 
 def grids_of(document: Document) -> Iterator[tuple[tuple[str, ...], FigureGrid]]:
@@ -108,17 +107,11 @@ def grids_of(document: Document) -> Iterator[tuple[tuple[str, ...], FigureGrid]]
     return of_sections(document.sections, ())
 
 
-def _library(grids: Sequence[FigureGrid]) -> str:
-    """The script that draws these plots, compressed, in base64; empty where there is nothing to draw."""
-    kinds = {trace.type for grid in grids for figure in grid.figures for trace in figure.plot.data}
-    return _bundle(bool(kinds - _CARTESIAN)) if grids else ""
-
-
 @cache
-def _bundle(whole: bool) -> str:
-    partial = files("omnibench.report").joinpath("templates/plotly/plotly-cartesian.min.js.gz")
-    compressed = gzip.compress(get_plotlyjs().encode()) if whole else partial.read_bytes()
-    return base64.b64encode(compressed).decode()
+def _library() -> str:
+    """Plotly's Cartesian bundle, which draws these plots, compressed, in base64."""
+    bundle = files("omnibench.report").joinpath("templates/plotly/plotly-cartesian.min.js.gz")
+    return base64.b64encode(bundle.read_bytes()).decode()
 
 
 @cache

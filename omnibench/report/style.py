@@ -188,7 +188,6 @@ _AXIS_STYLE = {
     "title": {"font": {"size": 13, "color": INK}, "standoff": 8},
     "automargin": True,
 }
-_POLAR_AXIS_STYLE = {"gridcolor": GRID, "linecolor": AXIS, "tickfont": {"size": 11, "color": QUIET}}
 _TEMPLATE = go.layout.Template(
     layout={
         "font": {"family": FONT, "size": 13, "color": INK},
@@ -197,7 +196,6 @@ _TEMPLATE = go.layout.Template(
         "colorway": list(PALETTE),
         "xaxis": _AXIS_STYLE,
         "yaxis": _AXIS_STYLE,
-        "polar": {"bgcolor": "white", "angularaxis": _POLAR_AXIS_STYLE, "radialaxis": _POLAR_AXIS_STYLE},
         "hoverlabel": {"bgcolor": "white", "bordercolor": AXIS, "font": {"family": FONT, "size": 12, "color": INK}},
         "modebar": {"bgcolor": "rgba(255,255,255,0.85)", "color": AXIS, "activecolor": INK},
     }

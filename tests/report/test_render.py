@@ -112,8 +112,6 @@ def library(*grids: blocks.FigureGrid) -> str:
 
 def test_a_page_holds_once_what_draws_its_plots_and_no_more_than_it_needs() -> None:
     assert len(re.findall(r"plotly\.js \(cartesian - minified\) v\d", library(grid(), grid()))) == 1
-    polar = blocks.FigureGrid((blocks.Figure("polar", go.Figure(go.Scatterpolar(r=[1], theta=[0])), "polar"),))
-    assert re.search(r"plotly\.js v\d", library(polar))
     assert Reader(render(document(blocks.Paragraph("text")))).scripts.get("library", "").strip() == ""
 
 

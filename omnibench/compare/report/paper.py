@@ -16,10 +16,11 @@ from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
 from omnibench.registry import calibrators
 from omnibench.report.blocks import Block, Callout, Cell, Column, Figure, FigureGrid, Row, Table
-from omnibench.report.figures import START, coordinates, marks, path
+from omnibench.report.figures import START, line, marks, path
 from omnibench.report.numbers import (
     MOST_MOTIONS,
     NOTHING,
+    Motion,
     count,
     direction_of,
     fixed,
@@ -32,7 +33,7 @@ from omnibench.report.numbers import (
     span,
 )
 from omnibench.report.recording.recording_figures import REFERENCE_ITEM, describe, evenly
-from omnibench.report.style import plan, plot, text
+from omnibench.report.style import plan
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -321,48 +322,34 @@ def flower_figures(view: views.DatasetView) -> Iterator[FigureGrid]:
         return
     legend = motion_items(motions)
     errors = [np.hypot(*each[:, :2].T) for each in (view.design_errors[view.scored], after)]
-    factor, unit, decimals = views.position_unit(float(errors[0].max()))
+    factor, unit, _ = views.position_unit(float(errors[0].max()))
     titles = ("design values", best.label)
     figures = [
         Figure(
             f"Mean final position error ({unit}), {title}",
-            _polar(runs, moving, motions, factor * of_model, 1.08 * factor * float(errors[0].max()), decimals),
+            _by_direction(runs, moving, motions, factor * of_model, 1.08 * factor * float(errors[0].max()), unit),
             f"Mean final position error in {unit} by direction of motion and rate of turn, {title}",
             300,
         )
         for title, of_model in zip(titles, errors, strict=True)
     ]
-    caption = "Angle: commanded direction α in the robot's frame, forward up. Mean over repetitions."
+    caption = "Distance from the middle: mean error over repetitions, along the commanded direction, forward up."
     yield FigureGrid(tuple(figures), tuple(legend), 2, caption, "errors-by-direction")
 
 
-def _polar(
-    runs: Sequence[Trajectory],
-    moving: Sequence[int],
-    motions: Sequence[tuple[float, float]],
-    errors: Array,
-    limit: float,
-    decimals: int,
+def _by_direction(
+    runs: Sequence[Trajectory], moving: Sequence[int], motions: Sequence[Motion], errors: Array, limit: float, unit: str
 ) -> go.Figure:
+    """Mean error of each motion as the distance from the middle along its commanded direction, forward up."""
     traces = []
     for motion, item in zip(motions, motion_items(motions), strict=True):
         rows = np.array([index for index in moving if motion_of(runs[index]) == motion])
         angles = np.array([direction_of(runs[index]) for index in rows])
         unique = np.unique(angles)
         means = np.array([errors[rows[angles == angle]].mean() for angle in unique])
-        traces.append(
-            go.Scatterpolar(
-                theta=coordinates(np.append(unique, unique[0])),
-                r=coordinates(np.append(means, means[0])),
-                mode="lines+markers",
-                line={"color": item.colour, "width": 2},
-                marker={"size": 5},
-                legendgroup=item.key,
-                hovertemplate=f"{text(item.label)}, α %{{theta:.0f}}°<br>%{{r:.{decimals}f}}<extra></extra>",
-            )
-        )
-    axis = {"range": [0, limit], "nticks": 5, "angle": 75, "tickangle": 75, "showline": False}
-    angular = {"rotation": 90, "direction": "counterclockwise", "dtick": 30, "ticksuffix": "°"}
-    figure = plot(*traces, polar={"angularaxis": angular, "radialaxis": axis})
-    figure.update_layout(margin={"l": 38, "r": 38, "t": 26, "b": 26})
-    return figure
+        along = np.radians(np.append(unique, unique[0]))
+        x, y = np.append(means, means[0]) * np.array([-np.sin(along), np.cos(along)])
+        words = [f"{item.label}, α {angle:.0f}°: {mean:.3g} {unit}" for angle, mean in zip(unique, means, strict=True)]
+        traces += [line(item, 2.0, x, y), marks(item, 5, x[:-1], y[:-1], hover="%{text}", words=words)]
+    window = limit * np.array([[-1.0, 1.0]] * 2)
+    return plan(*traces, window=window, x_title=f"to the right ({unit})", y_title=f"ahead ({unit})")
