@@ -49,6 +49,7 @@ from omnibench.fit.geometry import WheelGeometry, searched_parameters
 from omnibench.fit.identifiability import warnings_of_calibration
 from omnibench.fit.intervals import UnitName, units_of
 from omnibench.fit.parameterisation import make_bounds
+from omnibench.fit.prior import mount_is_fitted
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.fit.span import Treatment, driven_span
 from omnibench.fit.uncertainty import NoCovarianceError, physical_parameters, uncertainty_of
@@ -357,12 +358,14 @@ def typical_answers(
     for run, result, done in zip(plan, results, scored, strict=True):
         if result.vector is None or not any(done is one for one in typical):
             continue
-        problem, uncertainty = run.problem(), None
-        if run.box_name != UNBOUNDED:
+        problem, uncertainty, cls = run.problem(), None, calibrators.entry(run.settings.calibrator).cls
+        if cls.fitted:
             with suppress(NoCovarianceError):  # its answer is no minimum
                 uncertainty = uncertainty_of(problem, result)
         effects = result.extension.effects if result.extension else ()
-        fitted_mount = run.settings.mount == "fit"
+        asked = None if cls.as_is else run.settings.mount  # of which an answer that stands as it is knows nothing
+        by_prior = cls.weighs_design and run.settings.tolerance is None
+        fitted_mount = mount_is_fitted(run.dataset.robot, asked, by_prior=by_prior)
         reading = physical_parameters(problem, result, uncertainty, effects, fitted_mount=fitted_mount)
         answers[run.dataset_name, run.label] = TypicalAnswer(uncertainty, reading.parameters)
     return answers
