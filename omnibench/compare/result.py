@@ -212,7 +212,7 @@ class EntryVerdict:
 class TypicalAnswer:
     """The answer of an entry's typical run.
 
-    uncertainty: None where it is no minimum, or is searched in no box. parameters: the physical ones that it means.
+    uncertainty: None where it is no minimum, or is not fitted. parameters: the physical ones that it means.
     """
 
     uncertainty: Uncertainty | None

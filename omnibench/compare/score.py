@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from omnibench.compare.config import CertificateChoice, CompareConfig
-from omnibench.compare.plan import UNBOUNDED, ComparedRobot, PlannedFit
+from omnibench.compare.plan import ComparedRobot, PlannedFit
 from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord, ScoredFit, SplitScore, TypicalAnswer
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.errors import OmnibenchError, PluginError
@@ -21,6 +21,7 @@ from omnibench.fit.evaluate import final_errors, positions_and_headings
 from omnibench.fit.geometry import WheelGeometry, searched_parameters
 from omnibench.fit.intervals import UnitName, units_of
 from omnibench.fit.parameterisation import make_bounds
+from omnibench.fit.prior import mount_is_fitted
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.fit.uncertainty import NoCovarianceError, physical_parameters, uncertainty_of
 from omnibench.progress import Progress, Reporter, no_progress
@@ -335,12 +336,14 @@ def typical_answers(
         fit, result = done.fit, done.result
         if result.vector is None or not any(done is one for one in typical):
             continue
-        problem, uncertainty = fit.problem(), None
-        if fit.box_name != UNBOUNDED:
+        problem, uncertainty, cls = fit.problem(), None, calibrators.entry(fit.settings.calibrator).cls
+        if cls.fitted:
             with suppress(NoCovarianceError):  # its answer is no minimum
                 uncertainty = uncertainty_of(problem, result)
         effects = result.extension.effects if result.extension else ()
-        fitted_mount = fit.settings.mount == "fit"
+        asked = None if cls.as_is else fit.settings.mount  # of which an answer that stands as it is knows nothing
+        by_prior = cls.weighs_design and fit.settings.tolerance is None
+        fitted_mount = mount_is_fitted(fit.dataset.robot, asked, by_prior=by_prior)
         reading = physical_parameters(problem, result, uncertainty, effects, fitted_mount=fitted_mount)
         answers[fit.robot.name, fit.label] = TypicalAnswer(uncertainty, reading.parameters)
     return answers

@@ -18,7 +18,7 @@ from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.identifiability import inseparable_in_words, kept_motions, warnings_of_calibration
 from omnibench.fit.open_combinations import open_sentences
 from omnibench.fit.path_errors import slip_of
-from omnibench.fit.prior import default_cost, default_mount, off_centre
+from omnibench.fit.prior import default_cost, default_mount, mount_is_fitted
 from omnibench.fit.problem import CalibrationProblem, make_problem
 from omnibench.fit.settings import CompleteSettings, CostChoice, FitSettings
 from omnibench.fit.span import WheelDirection
@@ -148,8 +148,8 @@ def calibrate(
     # The physical parameters, the calibration file, and what the data leave open.
     searched = problem.parameterisation
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
-    by_prior = calibrator.weighs_design and chosen.tolerance is None and off_centre(robot)
-    fitted_mount = (asked.mount or ("fit" if by_prior else default_mount(robot))) == "fit"
+    by_prior = calibrator.weighs_design and chosen.tolerance is None
+    fitted_mount = mount_is_fitted(robot, asked.mount, by_prior=by_prior)
     reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
     return CalibrationRun(
         calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),

@@ -71,6 +71,15 @@ def off_centre(robot: Robot) -> bool:
     return robot.slides and not robot.skid
 
 
+def mount_is_fitted(robot: Robot, mount: MountChoice | None, *, by_prior: bool) -> bool:
+    """True if the place of the tracked point is among what a fit tells: as asked for, or as is usual for the robot.
+
+    by_prior: the fit weighs the class's own prior, see ``off_centre``.
+    """
+    usual = "fit" if by_prior and off_centre(robot) else default_mount(robot)
+    return (mount or usual) == "fit"
+
+
 def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: MountChoice | None = None) -> Array:
     """A root (3M, k) of the covariance of the matrix elements, row by row, about the design: Eq. (1) to (3).
 

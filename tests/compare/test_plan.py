@@ -377,13 +377,16 @@ def test_the_calibrations_evaluate_to_the_costs_in_the_summary(results: Path) ->
         assert calibration.provenance.fitted == dataset.fingerprints("train")
 
 
-def test_a_comparison_writes_the_physical_parameters_that_calibrate_does(results: Path) -> None:
-    run = calibrate(compared_once().datasets["flower"], "closed_form", integration="arc")
-    found = read_calibration(results / "calibrations" / "flower-closed_form.yaml").parameters
-    assert set(found) == set(run.calibration.parameters)
-    for name, parameter in run.calibration.parameters.items():
-        assert found[name].value == pytest.approx(parameter.value, rel=1e-6)
-        assert found[name].low == pytest.approx(parameter.low, rel=1e-4)
+@pytest.mark.parametrize("name", ["closed_form", "map"])
+def test_a_comparison_writes_the_physical_parameters_that_calibrate_does(name: str, tmp_path: Path) -> None:
+    dataset = compared_here(tmp_path, calibrators=[name]).datasets["flower"]
+    expected = calibrate(dataset, name, cost="final_pose").calibration.parameters
+    found = read_calibration(tmp_path / "calibrations" / f"flower-{name}.yaml").parameters
+    assert set(found) == set(expected)
+    assert ("mount_x" in found) is (name == "map")
+    for parameter, wanted in expected.items():
+        assert found[parameter].value == pytest.approx(wanted.value, rel=1e-6, abs=1e-9)
+        assert found[parameter].low == pytest.approx(wanted.low, rel=1e-4, abs=1e-9)
 
 
 def test_calibrations_of_labels_that_look_alike_do_not_overwrite_each_other(tmp_path: Path) -> None:
