@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -84,8 +85,8 @@ def write_results(result: ComparisonResult) -> None:
     except (OSError, ValueError, KeyError, TypeError):
         earlier = []
     disk.write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
-    for name, table in _tables(result).items():
-        disk.write_table(result.output / f"{name}.parquet", table)
+    for name, make in result_tables(result).items():
+        disk.write_table(result.output / f"{name}.parquet", make())
     for file in earlier:
         disk.remove(file)
     fitted = _fitted(result)
@@ -244,9 +245,12 @@ _CELL_COLUMNS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def result_table(result: ComparisonResult, name: str) -> pl.DataFrame:
-    """One of the tables beside the report: study; of data sets also statistics, runs, errors and history."""
-    return _tables(result)[name]
+def result_tables(result: ComparisonResult) -> dict[str, Callable[[], pl.DataFrame]]:
+    """Makers of the tables beside the report: study; of data sets also statistics, runs, errors and history."""
+    makers: dict[str, Callable[[ComparisonResult], pl.DataFrame]] = {"study": cell_table}
+    if result.config.datasets:
+        makers = {"statistics": _statistics, "runs": _runs, "errors": _errors, "history": _history} | makers
+    return {name: partial(make, result) for name, make in makers.items()}
 
 
 def cell_table(result: ComparisonResult) -> pl.DataFrame:
@@ -280,17 +284,33 @@ def _cell_row(result: ComparisonResult, cell: Cell, method: MethodInCell) -> dic
     }  # fmt: skip
 
 
-def _tables(result: ComparisonResult) -> dict[str, pl.DataFrame]:
-    statistics = [_statistics_row(entry) for entry in result.statistics]
-    if result.config.robots:
-        return {"study": cell_table(result)}
-    return {
-        "runs": _table([_run_row(run) for run in result.runs], RunRecord),
-        "errors": pl.DataFrame(list(_error_rows(result)), _ERROR_COLUMNS, orient="row"),
-        "history": pl.DataFrame(list(_history_rows(result.runs)), _HISTORY_COLUMNS, orient="row"),
-        "statistics": _table(statistics, EntryStatistics, _INTERVAL_COLUMNS),
-        "study": cell_table(result),
-    }
+def _runs(result: ComparisonResult) -> pl.DataFrame:
+    rows = [run.record.model_dump(mode="json") for run in result.runs]
+    nested = ("options", "parameters")  # of no fixed shape
+    return _table([row | {name: json.dumps(row[name]) for name in nested} for row in rows], RunRecord)
+
+
+def _statistics(result: ComparisonResult) -> pl.DataFrame:
+    return _table([_statistics_row(entry) for entry in result.statistics], EntryStatistics, _INTERVAL_COLUMNS)
+
+
+def _errors(result: ComparisonResult) -> pl.DataFrame:
+    rows = [
+        (*_key(run), split, trajectory.id, trajectory.command, *error, cost)
+        for run in result.runs
+        for split, score in run.scores.items()
+        for trajectory, error, cost in zip(
+            run.fit.robot.dataset.split(split), score.errors.tolist(), score.costs.tolist(), strict=True
+        )
+    ]
+    return pl.DataFrame(rows, _ERROR_COLUMNS, orient="row")
+
+
+def _history(result: ComparisonResult) -> pl.DataFrame:
+    rows = [
+        (*_key(run), step.evaluations, step.seconds, step.cost) for run in result.runs for step in run.result.history
+    ]
+    return pl.DataFrame(rows, _HISTORY_COLUMNS, orient="row")
 
 
 def _table(rows: list[dict[str, Any]], kind: type, further: Mapping[str, Any] | None = None) -> pl.DataFrame:
@@ -301,22 +321,15 @@ def _table(rows: list[dict[str, Any]], kind: type, further: Mapping[str, Any] | 
     return pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
 
 
-def _run_row(run: ScoredFit) -> dict[str, Any]:
-    row = run.record.model_dump(mode="json")
-    for name in ("options", "parameters"):  # nested values of no fixed shape
-        row[name] = json.dumps(row[name])
-    return row
-
-
 def _statistics_row(entry: EntryStatistics) -> dict[str, Any]:
     """An entry's statistics as a flat row, with two columns of intervals for each split."""
     row: dict[str, Any] = {}
     for name in (item.name for item in fields(entry)):
-        if name == "splits":
+        if name == "costs":
             for split in SPLITS:
-                row[split] = _interval_cell(entry.cost(split))
-                row[f"{split}_improvement"] = _interval_cell(entry.improvement(split))
-        elif name != "typical":
+                row[split] = _interval_cell(entry.costs.get(split))
+                row[f"{split}_improvement"] = _interval_cell(entry.improvements.get(split))
+        elif name not in ("typical", "improvements"):
             value = getattr(entry, name)
             row[name] = _interval_cell(value) if isinstance(value, Interval) else value
     return row | {"typical_seed": None if entry.typical is None else entry.typical.record.seed}
@@ -324,23 +337,6 @@ def _statistics_row(entry: EntryStatistics) -> dict[str, Any]:
 
 def _interval_cell(interval: Interval | None) -> dict[str, float | None] | None:
     return None if interval is None else asdict(interval)
-
-
-def _error_rows(result: ComparisonResult) -> Iterator[tuple[Any, ...]]:
-    """Rows of _ERROR_COLUMNS."""
-    for run in result.runs:
-        for split, score in run.scores.items():
-            trajectories = result.datasets[run.record.dataset].split(split)
-            costs = score.costs.tolist()
-            for trajectory, error, cost in zip(trajectories, score.errors.tolist(), costs, strict=True):
-                yield (*_key(run), split, trajectory.id, trajectory.command, *error, cost)
-
-
-def _history_rows(runs: Iterable[ScoredFit]) -> Iterator[tuple[Any, ...]]:
-    """Rows of _HISTORY_COLUMNS."""
-    for run in runs:
-        for step in run.result.history:
-            yield (*_key(run), step.evaluations, step.seconds, step.cost)
 
 
 def _key(run: ScoredFit) -> tuple[str, str, int]:

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import field_serializer
 
 from omnibench.compare.config import AS_RECORDED, CompareConfig
 from omnibench.compare.plan import ComparedRobot, PlannedFit, SearchSpace
@@ -26,21 +26,6 @@ from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.views import Shown
-
-_DEVIATIONS = ("deviation", "deviation_percent")  # keys of summary.json that follow from value and design
-
-
-def _row(parameter: PhysicalParameter) -> dict[str, Any]:
-    """A number of a searched geometry as summary.json has it."""
-    of_search = parameter.model_dump(exclude={"low", "high"})
-    return of_search | {name: getattr(parameter, name) for name in _DEVIATIONS}
-
-
-def _from_row(row: Any) -> Any:
-    return {name: row[name] for name in row if name not in _DEVIATIONS} if isinstance(row, dict) else row
-
-
-SearchedParameter = Annotated[PhysicalParameter, BeforeValidator(_from_row), PlainSerializer(_row)]
 
 
 class RunRecord(Model):
@@ -76,12 +61,22 @@ class RunRecord(Model):
     reference_seconds: float | None = None
     machine: str | None = None
     matrix: tuple[Row, Row, Row] | None
-    parameters: tuple[SearchedParameter, ...] | None
+    parameters: tuple[PhysicalParameter, ...] | None
     at_bounds: tuple[str, ...]
     held: tuple[str, ...]
     gap: float | None
     gap_box: str | None
     proven_gap: float | None
+
+    @field_serializer("parameters")
+    def _with_deviations(self, parameters: tuple[PhysicalParameter, ...] | None) -> list[dict[str, Any]] | None:
+        deviations = ("deviation", "deviation_percent")  # follow from value and design
+        if parameters is None:
+            return None
+        rows = [each.model_dump(exclude={"low", "high"}) for each in parameters]
+        return [
+            row | {name: getattr(each, name) for name in deviations} for row, each in zip(rows, parameters, strict=True)
+        ]
 
 
 class BoxCertificate(Model):
@@ -150,22 +145,12 @@ class ScoredFit:
 
 
 @dataclass(frozen=True)
-class SplitStatistics:
-    """Statistics of an entry's typical run on one split.
-
-    improvement: share of the design values' cost that is gone; None where that cost is zero.
-    """
-
-    cost: Interval
-    improvement: Interval | None
-
-
-@dataclass(frozen=True)
 class EntryStatistics:
     """One entry of the comparison (calibrator, parameterisation, box) on one data set, over its seeds.
 
     typical: the run of median training cost, to which intervals and differences refer. train_spread: interquartile
-    range of the training cost over seeds. splits: the typical run by split; empty without an answer. difference: paired
+    range of the training cost over seeds. costs, improvements: of the typical run by split; empty without an answer; an
+    improvement is the share of the design values' cost that is gone, None where that cost is zero. difference: paired
     mean difference in validation cost (training cost where there is no validation split) from the best entry.
     practically_equal: None where the difference has no interval. reference_evaluations_median: time in evaluations of
     the start's cost on the machine of each run, which machines of different speed have in common; None if not known.
@@ -181,7 +166,8 @@ class EntryStatistics:
     typical: ScoredFit | None
     train_median: float | None
     train_spread: float | None
-    splits: Mapping[Split, SplitStatistics]
+    costs: Mapping[Split, Interval]
+    improvements: Mapping[Split, Interval | None]
     difference: Interval | None
     practically_equal: bool | None
     is_best: bool
@@ -190,14 +176,6 @@ class EntryStatistics:
     evaluations_median: float | None
     seconds_median: float | None
     reference_evaluations_median: float | None
-
-    def cost(self, split: Split) -> Interval | None:
-        """The mean cost on a split; None without an answer, or without such a split."""
-        return self.splits[split].cost if split in self.splits else None
-
-    def improvement(self, split: Split) -> Interval | None:
-        """The share by which the cost on a split lies below that of the design values; None where not known."""
-        return self.splits[split].improvement if split in self.splits else None
 
 
 @dataclass(frozen=True)
@@ -234,10 +212,9 @@ class CellKey:
     fitted: bool
 
     @property
-    def words(self) -> str:
-        """The cell in words."""
-        regime = "" if self.regime == AS_RECORDED else f", {self.regime}"
-        return f"{self.robot}: {self.training} -> {self.judged}{regime}"
+    def within_robot(self) -> str:
+        """Training and judged runs: ``circular → square``."""
+        return f"{self.training} → {self.judged}{' (training errors)' if self.fitted else ''}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +266,11 @@ class Cell:
     def mean(self, method: str) -> float | None:
         """A method's mean error, Eq. (6); None where it was not asked, or has no answer."""
         return self.methods[method].mean("cost") if method in self.methods else None
+
+    def share(self, method: str) -> float | None:
+        """A method's mean error, Eq. (6), as a share of the design values'; None without an answer."""
+        ratio = self.against_design(method, 1)
+        return None if ratio is None else ratio.value
 
     def against_design(self, method: str, cells: int) -> CellRatio | None:
         """A method's mean error, Eq. (6), as a ratio to the design values'; None without an answer."""
@@ -360,6 +342,11 @@ class ComparisonResult(Shown):
     def judged_cells(self) -> tuple[Cell, ...]:
         """Cells of recorded training runs that other runs judge: what verdicts, ranks and profiles rest on."""
         return tuple(cell for cell in self.cells if not cell.key.fitted and cell.key.regime == AS_RECORDED)
+
+    def recorded_cells(self, robot: str) -> tuple[Cell, ...]:
+        """The cells of a robot's recorded training runs: those that other runs judge, then training errors."""
+        mine = [cell for cell in self.cells if cell.key.robot == robot and cell.key.regime == AS_RECORDED]
+        return tuple(sorted(mine, key=lambda cell: cell.key.fitted))
 
     @cached_property
     def against_best(self) -> tuple[AgainstBest, ...]:

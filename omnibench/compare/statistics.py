@@ -38,7 +38,6 @@ from omnibench.compare.result import (
     MethodInCell,
     ScoredFit,
     SplitScore,
-    SplitStatistics,
 )
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.evaluate import judge, nothing_held_out
@@ -76,12 +75,7 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
         difference, equal = None, None
         if median_run is not None and best is not None:
             difference, equal = _against_best(median_run, best, intervals)
-        splits: dict[Split, SplitStatistics] = {}
-        if median_run is not None:
-            for split, score in median_run.scores.items():
-                cost, designed = intervals.mean(score.costs, score.units), median_run.design[split].costs
-                improvement = intervals.improvement(score.costs, designed, score.units, score.rounding)
-                splits[split] = SplitStatistics(cost, improvement)
+        scores, design = (median_run.scores, median_run.design) if median_run is not None else ({}, {})
         records = [run.record for run in group]
         ratios = [each.seconds / each.reference_seconds for each in records if each.reference_seconds]
         statistics.append(
@@ -96,7 +90,11 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
                 typical=median_run,
                 train_median=float(np.median(costs)) if costs else None,
                 train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
-                splits=splits,
+                costs={split: intervals.mean(score.costs, score.units) for split, score in scores.items()},
+                improvements={
+                    split: intervals.improvement(score.costs, design[split].costs, score.units, score.rounding)
+                    for split, score in scores.items()
+                },
                 difference=difference,
                 practically_equal=equal,
                 is_best=median_run is not None and median_run is best,

@@ -310,7 +310,7 @@ def test_the_same_seed_draws_the_same_intervals() -> None:
 def test_an_interval_is_as_wide_as_the_standard_error_says() -> None:
     costs = np.random.default_rng(1).normal(5.0, 1.0, 400)
     entry = of([scored("a", costs)], Bootstrap(resamples=20_000))["a"]
-    train = entry.cost("train")
+    train = entry.costs["train"]
     error = costs.std(ddof=1) / np.sqrt(400)
     assert train.value == pytest.approx(costs.mean())
     assert train.low == pytest.approx(costs.mean() - 1.96 * error, abs=0.05 * error)
@@ -392,7 +392,7 @@ def test_runs_without_an_answer_are_counted_and_left_out() -> None:
 
 def test_an_entry_without_any_answer_has_no_statistics_and_is_never_best() -> None:
     entry = of([scored("a", None), scored("b", np.full(8, 2.0))])["a"]
-    assert (entry.typical, entry.cost("train"), entry.train_median, entry.difference) == (None, None, None, None)
+    assert (entry.typical, entry.costs.get("train"), entry.train_median, entry.difference) == (None, None, None, None)
     assert (entry.practically_equal, entry.is_best) == (None, False)
 
 
@@ -407,8 +407,8 @@ def test_one_or_two_runs_have_no_interval_and_nothing_is_said_to_differ(number: 
         scored(name, np.full(number, cost), theoretical=np.full(number, 4.0)) for name, cost in (("a", 2), ("b", 3))
     ]
     entries = of(runs)
-    improvement, difference = entries["a"].improvement("train"), entries["b"].difference
-    assert (entries["a"].cost("train").value, entries["a"].cost("train").known) == (2.0, None)
+    improvement, difference = entries["a"].improvements["train"], entries["b"].difference
+    assert (entries["a"].costs["train"].value, entries["a"].costs["train"].known) == (2.0, None)
     assert (improvement.value, improvement.known) == (0.5, None)
     assert (difference.known, entries["b"].practically_equal) == (None, None)
 

@@ -1,30 +1,32 @@
-"""The answer of a comparison on one data set: a sentence, the main figures, paths before and after, doubts."""
+"""The answer of a comparison: a sentence, the main figures, the paths before and after or all ratios, and doubts."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
-
-import numpy as np
-import plotly.graph_objects as go
 
 from omnibench.compare.config import THEORETICAL_NAME
 from omnibench.compare.report import view as views
-from omnibench.compare.result import EntryStatistics
+from omnibench.compare.report.charts import interval_chart
+from omnibench.compare.report.tables import methods_table
+from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
-from omnibench.fit.intervals import Interval
 from omnibench.report import blocks
-from omnibench.report.figures import joined, line, marks
 from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
-from omnibench.report.style import INK, PALETTE, QUIET, plot, text, wrapped
+from omnibench.report.style import INK, PALETTE, QUIET, logarithmic
 from omnibench.words import plural
 
-_ROW, _LINE = 11, 14  # px of an entry, and of each line of its label
 _BEST = blocks.LegendItem("best", "best", PALETTE[0])
 _OTHER = blocks.LegendItem("other", "differs by more than chance", PALETTE[1])
 _OPEN = blocks.LegendItem("open", "not told apart", QUIET)
+_VERDICTS = {
+    "better": blocks.LegendItem("better", "less error than the best published method", PALETTE[0]),
+    "undecided": blocks.LegendItem("undecided", "chance could explain the difference", QUIET),
+    "worse": blocks.LegendItem("worse", "more error", "#c8102e"),
+}
 _ARRIVED = 0.01  # relative: a search whose training cost is further above the lowest one missed the minimum (chosen)
 _SEEDS_DIFFER = 0.25  # share of the interval's width: seeds whose costs differ by more are worth a remark (chosen)
 
@@ -34,32 +36,27 @@ def answer_section(view: views.DatasetView) -> blocks.Section:
     more: list[blocks.Block] = []
     if (chart := entry_chart(view)) is not None:
         more.append(chart)
-    if view.held_out is not None:
-        verdict = view.held_out.verdict
-        tone: blocks.Tone = "plain" if verdict.verdict == "better" else "warning"
-        words = typeset(f"{view.held_out.label}, {verdict.sentence}")
-        more.append(blocks.Callout(words, (typeset(verdict.detail),), tone))
+    if (held_out := view.result.held_out.get(view.name)) is not None:
+        tone: blocks.Tone = "plain" if held_out.verdict.verdict == "better" else "warning"
+        words = typeset(f"{held_out.label}, {held_out.verdict.sentence}")
+        more.append(blocks.Callout(words, (typeset(held_out.verdict.detail),), tone))
     if sessions := view.result.sessions.get(view.name, ()):
         more.append(blocks.Callout("Sessions", sessions, "warning"))
     doubts, remarks = tuple(_doubts(view)), tuple(_remarks(view))
     failed = any(entry.answers < entry.runs for entry in view.statistics)
-    tone = "warning" if doubts or failed else "plain"
-    more.append(blocks.Callout("To be kept in mind", (*doubts, *remarks), tone))
-    won = view.best is not None and view.best.calibrator != THEORETICAL_NAME
-    tiles = tuple(_tiles(view)) if won else ()
+    more.append(blocks.Callout("To be kept in mind", (*doubts, *remarks), "warning" if doubts or failed else "plain"))
     picture = None if view.best is None else path_picture(view)
-    return blocks.answer_section(answer_sentence(view), tiles, picture, *more)
+    return blocks.answer_section(answer_sentence(view), tuple(_tiles(view)), picture, *more)
 
 
 def answer_sentence(view: views.DatasetView) -> str:
-    """The answer in a sentence or two: what the best calibration gained, and what it is not told apart from."""
-    best, split = view.best, view.scored
-    labels = [entry.label for entry, _ in view.calibrated]
+    """What the best calibration gained, and what it is not told apart from."""
+    best, labels = view.best, [entry.label for entry, _ in view.calibrated]
     if best is None:
         return f"No calibrator gave an answer: {plural(len(view.runs), 'run')}, none usable; the reasons are below."
     if not labels:
         return "Only the design values gave an answer; there is no calibration to compare them with."
-    runs = plural(len(view.dataset.split(split)), f"{views.SPLIT_NAMES[split]} run")
+    runs = view.runs_in_words(view.scored)
     if best.calibrator == THEORETICAL_NAME:
         return f"No calibrator did better than the design values on the {runs}: {listing(labels)}."
     words = f"On the {runs}, {best.label} has the best calibration"
@@ -70,109 +67,87 @@ def answer_sentence(view: views.DatasetView) -> str:
         if view.without_poses:
             words = f"On the {runs}, {best.label} misses the references by {after}, where the design values miss them "
             words += f"by {before}"
-    improvement = best.improvement(split)
-    if improvement is not None:
-        fell, sure = views.improvement_cells(best, split, 1)
-        words += f": the cost fell by {fell}{_with_interval(sure)}"
-        chance = improvement.known is not None and improvement.holds(0.0)
-        words += ", which the noise alone could explain" if chance else ""
+    if (improvement := best.improvements.get(view.scored)) is not None:
+        fell, sure = views.improvement_cells(improvement, 1)
+        words += f": the cost fell by {fell}{'' if improvement.known is None else f' (95 % interval {sure})'}"
+        words += ", which the noise alone could explain" if improvement.known and improvement.holds(0.0) else ""
     if len(labels) == 1:
         return f"{words}. {best.label} is the only calibrator with an answer."
     if view.undecided:
-        return f"{words}. Which entry is best cannot be said ({view.units(split).ratio_words})."
-    if not view.rivals:
-        return f"{words}. {best.label} is best."
+        return f"{words}. Which entry is best cannot be said ({view.units(view.scored).ratio_words})."
     rivals = ["the design values" if e.calibrator == THEORETICAL_NAME else e.label for e in view.rivals]
-    named = listing(rivals, 3) if len(rivals) <= 3 else f"{len(rivals)} other entries"
+    if not rivals:
+        return f"{words}. {best.label} is best."
+    named = listing(rivals) if len(rivals) <= 3 else f"{len(rivals)} other entries"
     return f"{words}. Not told apart from it: {named}; it has the lowest training cost of these."
 
 
 def _changes(view: views.DatasetView, best: EntryStatistics) -> Iterator[tuple[str, str, str]]:
     """Mean errors of positions, then of headings, before and after calibration, and the worst one after."""
-    after = None if best.typical is None else view.errors(best.typical, view.scored)
+    after = view.errors(best, view.scored)
     if after is None:
         return
     (p0, h0), (p1, h1) = positions_and_headings(view.design_errors[view.scored]), positions_and_headings(after)
     factor, unit, digits = views.position_unit(views.mean_and_worst(p0)[0], views.mean_and_worst(p1)[0])
     for was, now, scale, decimals, of_scale in ((p0, p1, factor, digits, unit), (h0, h1, math.degrees(1.0), 2, "°")):
-        (mean, worst), (before, _) = views.mean_and_worst(now), views.mean_and_worst(was)
-        if not math.isnan(mean):
-            old, new, most = (with_unit(fixed(scale * each, decimals), of_scale) for each in (before, mean, worst))
-            yield old, new, most
+        numbers = (views.mean_and_worst(was)[0], *views.mean_and_worst(now))
+        if not math.isnan(numbers[1]):
+            old, new, worst = (with_unit(fixed(scale * each, decimals), of_scale) for each in numbers)
+            yield old, new, worst
 
 
 def _tiles(view: views.DatasetView) -> Iterator[blocks.Fact]:
     best, split, decimals = view.best, view.scored, view.cost_decimals
-    assert best is not None  # there is an answer
+    if best is None or best.calibrator == THEORETICAL_NAME:
+        return
     for old, new, worst in _changes(view, best):
-        kind = "heading" if worst.endswith("°") else "position"
-        name = f"Final {kind} error, mean"
-        if view.without_poses:
-            name = f"Error of {'angles' if kind == 'heading' else 'lengths and places'}, mean"
-        before = old if kind == "heading" else old.rpartition(" ")[0]
-        yield blocks.Fact(name, f"{before} → {new}", f"worst {worst}")
-    reached = best.cost(split)
-    if reached is not None:
-        change = f"{fixed(view.theoretical_cost(split), decimals)} → {fixed(reached.value, decimals)}"
-        sure = _with_interval(views.interval_cell(reached, decimals)).strip(" ()")
-        yield blocks.Fact(f"Cost, {views.SPLIT_NAMES[split]} runs", change, sure)
-    if best.improvement(split) is not None:
-        fell, sure = views.improvement_cells(best, split, 1)
-        yield blocks.Fact("Improvement of the cost", fell, _with_interval(sure).strip(" ()"))
-
-
-def _with_interval(words: str) -> str:
-    return "" if words == views.NO_INTERVAL else f" (95 % interval {words})"
+        kind, parts = ("heading", "angles") if worst.endswith("°") else ("position", "lengths and places")
+        name = f"Error of {parts}, mean" if view.without_poses else f"Final {kind} error, mean"
+        yield blocks.Fact(name, f"{old if kind == 'heading' else old.rpartition(' ')[0]} → {new}", f"worst {worst}")
+    cost, improvement = best.costs[split], best.improvements[split]
+    before = fixed(view.design_costs[split].value, decimals)
+    sure = f"95 % interval {views.interval_cell(cost, decimals)}" if cost.known else ""
+    yield blocks.Fact(f"Cost, {views.SPLIT_NAMES[split]} runs", f"{before} → {fixed(cost.value, decimals)}", sure)
+    if improvement is not None:
+        fell, sure = views.improvement_cells(improvement, 1)
+        yield blocks.Fact("Improvement of the cost", fell, f"95 % interval {sure}" if improvement.known else "")
 
 
 def path_picture(view: views.DatasetView) -> blocks.FigureGrid | None:
     """Paths of a few runs of the scored split: reference, design values and the best calibration."""
-    models = [(views.THEORETICAL_STYLE, view.model(view.design_matrix))]
-    best = view.best
+    models, best = [(views.THEORETICAL_STYLE, view.model())], view.best
     if best is not None and best.calibrator != THEORETICAL_NAME and best.typical is not None:
-        run = best.typical
-        if run.matrix is not None:
-            style = blocks.LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
-            models.append((style, view.model(run.matrix, run.result.extension)))
+        style = blocks.LegendItem("calibrated", f"calibrated by {best.label}", CALIBRATED)
+        models.append((style, view.model(best.typical.matrix, best.typical.result.extension)))
     return paths_before_after(view.dataset.split(view.scored), models, views.SPLIT_NAMES[view.scored])
 
 
 def entry_chart(view: views.DatasetView) -> blocks.FigureGrid | None:
     """Every entry's cost on the scored split, the lowest on top; None where no entry was calibrated."""
-    lines: list[tuple[str, Interval, blocks.LegendItem]] = []
-    for entry, _ in view.calibrated:
-        if (cost := entry.cost(view.scored)) is not None:
-            best = entry.is_best and not view.undecided
-            lines.append((entry.label, cost, _BEST if best else _OTHER if entry.practically_equal is False else _OPEN))
-    if not lines:
+    known = [(entry, entry.costs[view.scored]) for entry, _ in view.calibrated if view.scored in entry.costs]
+    if not known:
         return None
-    lines.sort(key=lambda each: each[1].value)
+    shown = []
+    for entry, cost in sorted(known, key=lambda each: each[1].value):
+        best = entry.is_best and not view.undecided
+        item = _BEST if best else _OTHER if entry.practically_equal is False else _OPEN
+        shown.append((entry.label, cost, item))
     if (design := view.design_costs.get(view.scored)) is not None:
-        lines.append(("design values", design, views.THEORETICAL_STYLE))
-    decimals, traces, items = view.cost_decimals, list[go.Scatter](), list[blocks.LegendItem]()
-    for item in (_BEST, _OTHER, _OPEN, views.THEORETICAL_STYLE):
-        mine = [(row, label, cost) for row, (label, cost, of_line) in enumerate(lines) if of_line is item]
-        spans = [np.column_stack([cost.known, [row, row]]) for row, _, cost in mine if cost.known is not None]
-        words = [f"{label}: {fixed(c.value, decimals)} ({views.interval_cell(c, decimals)})" for _, label, c in mine]
-        traces += [line(item, 2.5, *joined(spans).T, line_dash="solid")] if spans else []
-        values, places = [cost.value for _, _, cost in mine], [float(row) for row, _, _ in mine]
-        traces += [marks(item, 10, values, places, hover="%{text}", words=words)] if mine else []
-        items += [item] if mine else []
-    split = views.SPLIT_NAMES[view.scored]
-    figure = plot(*traces, x_title=f"cost of the {split} runs")
-    figure.update_xaxes(range=[0.0, 1.04 * max(max(cost.known or (cost.value,)) for _, cost, _ in lines)])
-    names = [text(wrapped(label)) for label, _, _ in lines]
-    height = 70 + (_ROW + _LINE * max(1 + name.count("<br>") for name in names)) * len(lines)
-    ends = {"range": [len(lines) - 0.4, -0.6], "tickvals": list(range(len(lines))), "ticktext": names}
-    figure.update_yaxes(**ends, ticks="", tickfont_color=INK, showgrid=False)
-    described = ", ".join(f"{label} {fixed(cost.value, decimals)}" for label, cost, _ in lines)
+        shown.append(("design values", design, views.THEORETICAL_STYLE))
+    digits, split = view.cost_decimals, views.SPLIT_NAMES[view.scored]
+    lines = [
+        (label, cost, item, f"{label}: {fixed(cost.value, digits)} ({views.interval_cell(cost, digits)})")
+        for label, cost, item in shown
+    ]
     title = f"All entries: cost of the {split} runs, with 95 % intervals"
     caption = (
         f"The lower, the better. Intervals: {view.units(view.scored).ratio_words}; whether entries differ is judged "
         "from paired differences, which is finer."
     )
-    picture = blocks.Figure(title, figure, f"{title}: {described}", height)
-    return blocks.FigureGrid((picture,), tuple(items), 1, caption, "all-entries")
+    chart = interval_chart(lines, title, f"cost of the {split} runs", caption, "all-entries")
+    most = max(max(cost.known or (cost.value,)) for _, cost, _ in shown)
+    chart.figures[0].plot.update_xaxes(range=[0.0, 1.04 * most])
+    return chart
 
 
 def _doubts(view: views.DatasetView) -> Iterator[str]:
@@ -181,15 +156,14 @@ def _doubts(view: views.DatasetView) -> Iterator[str]:
     if best is None or best.typical is None or best.calibrator == THEORETICAL_NAME:
         return
     values = [run.scores[split].cost for run in view.runs if run.record.label == best.label and split in run.scores]
-    reached = best.cost(split)
-    low, high = (None if reached is None else reached.known) or (0.0, 0.0)
+    low, high = best.costs[split].known or (0.0, 0.0)
     if len(values) > 1 and max(values) - min(values) > _SEEDS_DIFFER * (high - low):
         yield (
             f"{best.label} depends on its seed: over {len(values)} seeds its {views.SPLIT_NAMES[split]} cost goes from "
             f"{span(min(values), max(values), decimals)}. The verdict is about the run of median training cost."
         )
-    lowest = min((entry.train_median for entry in view.statistics if entry.train_median is not None), default=None)
-    if best.train_median is not None and lowest is not None and best.train_median > (1 + _ARRIVED) * lowest + NO_ERROR:
+    lowest = min(entry.train_median for entry in view.statistics if entry.train_median is not None)
+    if best.train_median is not None and best.train_median > (1 + _ARRIVED) * lowest + NO_ERROR:
         above = f"{percent(best.train_median / lowest - 1)} above the lowest"
         if lowest <= NO_ERROR:
             above = f"{significant(best.train_median, 2)}, where the lowest leaves no error"
@@ -197,7 +171,6 @@ def _doubts(view: views.DatasetView) -> Iterator[str]:
             f"{best.label} has not found the minimum: its training cost is {above}. That it does better on other data "
             "may be chance, or the splits differ in more than noise."
         )
-    # Entries whose held-out cost is lower by more than the noise, though their training cost is higher
     lower = [
         "{}: {} ({})".format(entry.label, *views.difference_cells(entry.difference))
         for entry, _ in view.calibrated
@@ -242,3 +215,53 @@ def _remarks(view: views.DatasetView) -> Iterator[str]:
             "The intervals are over runs like these. Runs of one command share what the model misses there, so for "
             "commands that were not driven here the spread is larger (bootstrap: {unit: command})."
         )
+
+
+def robots_sentence(result: ComparisonResult) -> str:
+    """The answer on several robots in a sentence."""
+    worse = sum(each.ratio.verdict == "worse" for each in result.against_best)
+    if result.geometric_mean is None:
+        cells, robots = plural(len(result.judged_cells), "cell"), plural(len(result.robots), "robot")
+        return f"{plural(len(result.config.entries), 'method')} judged in {cells} of {robots}, by runs not seen before."
+    return (
+        f"The error of {result.config.reference} is {fixed(result.geometric_mean, 2)} times that of the best published "
+        f"method of each cell (geometric mean of {plural(len(result.against_best), 'cell')}); it is worse beyond "
+        f"chance in {worse or 'none'}."
+    )
+
+
+def robots_answer(result: ComparisonResult) -> blocks.Section:
+    """The sentence, tiles, and the reference method beside the best published one in every cell."""
+    asked = sum(not run.fit.refusal for run in result.runs)
+    size = f"{plural(len(result.config.entries), 'method')}, {plural(len(result.robots), 'robot')}"
+    tiles = [blocks.Fact("Size", size, f"{plural(len(result.judged_cells), 'cell')}, {plural(asked, 'fit')}")]
+    if (chart := ratio_chart(result)) is not None:
+        mean, verdicts = fixed(result.geometric_mean, 2), Counter(each.ratio.verdict for each in result.against_best)
+        tiles.append(blocks.Fact("Ratio of errors, geometric mean", mean, "below 1: less error"))
+        counts = ", ".join(str(verdicts[name]) for name in ("better", "undecided", "worse"))
+        tiles.append(blocks.Fact("Better, undecided, worse", counts, "cells, family-wise"))
+    return blocks.answer_section(robots_sentence(result), tiles, chart, methods_table(result))
+
+
+def ratio_chart(result: ComparisonResult) -> blocks.FigureGrid | None:
+    """The reference method's error as a ratio to the best published one's, cell by cell; None without such cells."""
+    lines = []
+    for each in result.against_best:
+        label = f"{each.cell.key.robot}: {each.cell.key.within_robot}"
+        words = (
+            f"{label}: {result.config.reference} {fixed(each.ratio.value, 2)} x {each.best} "
+            f"({views.interval_cell(each.ratio.in_family, 2)}, {each.ratio.units})"
+        )
+        lines.append((f"{label}  [{each.best}]", each.ratio.in_family, _VERDICTS[each.ratio.verdict], words))
+    if not lines:
+        return None
+    caption = (
+        f"Ratio of {result.config.reference}'s mean error to that of the published method of least error in the cell, "
+        "in brackets, which is chosen after the fact: the comparison favours it. Intervals hold for all cells together."
+    )
+    title = "Beside the best published method, cell by cell"
+    chart = interval_chart(lines, title, "ratio of errors", caption, "against-the-best-published")
+    ratios, figure = [each.ratio.value for each in result.against_best], chart.figures[0].plot
+    logarithmic(figure, "x", max(min([*ratios, 0.5]) / 2, 0.05), min(max([*ratios, 2.0]) * 2, 20.0))
+    figure.add_vline(x=1.0, line_color=INK, line_width=1)
+    return chart

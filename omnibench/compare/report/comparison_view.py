@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import plotly.graph_objects as go
 import polars as pl
 
-from omnibench.compare.output import calibration_file, result_table, summary
-from omnibench.compare.report.answer import answer_sentence, entry_chart
+from omnibench.compare.output import calibration_file, result_tables, summary
+from omnibench.compare.report import tables
+from omnibench.compare.report.answer import answer_sentence, entry_chart, ratio_chart, robots_sentence
 from omnibench.compare.report.document import comparison_document
-from omnibench.compare.report.robots import cells_table, methods_table, robots_answer, robots_sentence
-from omnibench.compare.report.tables import (
-    answer_table,
-    certificate_table,
-    cost_table,
-    entry_table,
-    final_error_table,
-    run_table,
-)
 from omnibench.compare.report.view import views
 from omnibench.compare.result import ComparisonResult
 from omnibench.errors import DataError, require_choice
-from omnibench.report.blocks import Document, FigureGrid, Table, Tone
+from omnibench.report.blocks import Document, Table, Tone
 from omnibench.report.calibration_report import how_to_use
 from omnibench.report.figures import drawn
 from omnibench.report.result import NextStep, Remark, Result
@@ -72,15 +63,18 @@ class ComparisonView(Result):
         return NextStep(unsure, f"{report} and record more runs for validation")
 
     def tables(self) -> Sequence[Table]:
-        if self.result.config.robots:
-            return [*([cells_table(self.result)] if self.everything else []), methods_table(self.result)]
-        tables: list[Table] = []
-        for view in views(self.result):
-            tables.append(answer_table(view))
+        result, shown = self.result, list[Table]()
+        if result.config.robots:
+            shown.append(tables.methods_table(result))
+            more = [tables.cell_table(result, cell) for cell in result.judged_cells]
+            return [*shown, *more, tables.outcome_table(result, result.runs)] if self.everything else shown
+        for view in views(result):
+            shown.append(tables.cost_table(view, view.scored, brief=not self.everything))
             if self.everything:
-                tables += [make(view, split) for make in (cost_table, final_error_table) for split in view.splits]
-                tables += [entry_table(view), *certificate_table(view), run_table(view)]
-        return tables
+                shown += [tables.cost_table(view, split) for split in view.splits[1:]]
+                shown += [tables.outcome_table(result, view.runs), *tables.certificate_table(view)]
+                shown.append(tables.outcome_table(result, view.runs, every=True))
+        return shown
 
     def remarks(self) -> Sequence[Remark]:
         return list(self._remarks())
@@ -107,23 +101,21 @@ class ComparisonView(Result):
         return summary(self.result)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        names = ("study",) if self.result.config.robots else ("statistics", "runs", "errors", "history", "study")
-        return {name: partial(result_table, self.result, name) for name in names}
+        return result_tables(self.result)
 
     def figure(self, dataset: str | None = None) -> go.Figure:
         """The cost of every entry with its 95 % interval. dataset: the name of one, if there are several.
 
         Of several robots: the reference method beside the best published one, cell by cell.
         """
-        if self.result.config.robots:
-            grids = [block for block in robots_answer(self.result).blocks if isinstance(block, FigureGrid)]
-            if not grids:
-                raise DataError("no method is compared with published ones: there is nothing to draw")
-            return drawn(grids[0])
         of_sets = {view.name: view for view in views(self.result)}
-        name = next(iter(of_sets)) if dataset is None else dataset
-        require_choice("data set", name, of_sets)
-        grid = entry_chart(of_sets[name])
+        if not of_sets:
+            grid = ratio_chart(self.result)
+            missing = "no method is compared with published ones"
+        else:
+            name = next(iter(of_sets)) if dataset is None else dataset
+            require_choice("data set", name, of_sets)
+            grid, missing = entry_chart(of_sets[name]), f"{name}: no entry was calibrated"
         if grid is None:
-            raise DataError(f"{name}: no entry was calibrated, so that there is nothing to draw")
+            raise DataError(f"{missing}: there is nothing to draw")
         return drawn(grid)

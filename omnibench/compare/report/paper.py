@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -12,10 +14,11 @@ import plotly.graph_objects as go
 from omnibench.compare.config import THEORETICAL_NAME, PublishedResult
 from omnibench.compare.report import view as views
 from omnibench.data.dataset import SPLITS, Split, Trajectory
+from omnibench.fit.calibrators.genetic import GeneticOptions
 from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
 from omnibench.registry import calibrators
-from omnibench.report.blocks import Block, Callout, Cell, Column, Figure, FigureGrid, Row, Table
+from omnibench.report.blocks import Block, Callout, Cell, Column, Fact, Facts, Figure, FigureGrid, Row, Table
 from omnibench.report.figures import START, line, marks, path
 from omnibench.report.numbers import (
     MOST_MOTIONS,
@@ -33,7 +36,7 @@ from omnibench.report.numbers import (
     span,
 )
 from omnibench.report.recording.recording_figures import REFERENCE_ITEM, describe, evenly
-from omnibench.report.style import plan
+from omnibench.report.style import AXIS, INK, plan, plot
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
@@ -52,13 +55,13 @@ def published_blocks(view: views.DatasetView) -> Iterator[Block]:
         yield Callout("The published costs cannot be set beside these", (remark,), "warning")
     elif published:
         yield _figure_table(view)
-        yield _circumstance_table(view)
-        yield from _effort_table(view)
+        yield _circumstances(view)
         if lines := _claims(view):
             yield Callout("What the paper claims, and what is seen here", lines)
         remarks = tuple(dict.fromkeys(remark for result in published for remark in result.remarks))
         if remarks:
             yield Callout("About the published figures", remarks)
+        yield from _fig_4(view)
 
 
 def _claims(view: views.DatasetView) -> tuple[str, ...]:
@@ -91,8 +94,8 @@ def _claims(view: views.DatasetView) -> tuple[str, ...]:
         ]
         proven = [
             f"; by proof no matrix of the box is more than {percent(certificate.gap, 2)} below it"
-            for certificate in view.certificates
-            if certificate.box == box
+            for certificate in view.result.certificates
+            if (certificate.dataset, certificate.box) == (view.name, box)
         ]
         lines.append(
             f"Local minima (section 5): from random starts in the box {box}, {listing(met)} ended within "
@@ -142,8 +145,8 @@ def compared_figures(view: views.DatasetView) -> list[ComparedFigure]:
     figures = list(_compared(published, None, view.design_costs, {}))
     for label, entry in {entry.label: entry for entry in own.values()}.items():
         same = [result for result in published if result.label in own and own[result.label].label == label]
-        reached = {split: cost for split in view.splits if (cost := entry.cost(split)) is not None}
-        fell = {split: share for split in view.splits if (share := entry.improvement(split)) is not None}
+        reached = {split: cost for split in view.splits if (cost := entry.costs.get(split)) is not None}
+        fell = {split: share for split in view.splits if (share := entry.improvements.get(split)) is not None}
         figures += _compared(same, label, reached, fell)
     return figures
 
@@ -198,6 +201,11 @@ def _figure_table(view: views.DatasetView) -> Table:
                 "simulated" if view.dataset.simulated else verdict,
             )
         )
+    for result, entry, _ in view.published_entries:
+        if result.seconds is not None:
+            here = Cell(seconds(entry.seconds_median), f"{count(entry.evaluations_median)} evaluations")
+            theirs_took = Cell(seconds(result.seconds), result.label)
+            rows.append(Row.of(f"Time, median ({entry.label})", here, theirs_took, NOTHING, "other hardware, program"))
     sources = listing(list(dict.fromkeys(result.source for result in view.config.published_results)))
     note = "As published: the 95 % interval (small print) contains a published figure."
     if view.dataset.simulated:
@@ -216,46 +224,26 @@ def _figure_table(view: views.DatasetView) -> Table:
     )
 
 
-def _effort_table(view: views.DatasetView) -> Iterator[Table]:
-    """Published computing times beside the evaluations and times of the entries that are the same methods."""
-    pairs = [(result, entry) for result, entry, _ in view.published_entries if result.seconds is not None]
-    if pairs and view.times_compare:
-        rows = [
-            Row.of(
-                Cell(result.label, f"here {entry.label}", view.styles[entry.label].colour),
-                seconds(result.seconds),
-                count(entry.evaluations_median),
-                seconds(entry.seconds_median),
-                fixed(entry.train_median, view.cost_decimals),
-            )
-            for result, entry in pairs
-        ]
-        titles = ("Time, published", "Evaluations here", "Time here", "CF training here")
-        columns = (Column("Method", numeric=False), *map(Column, titles))
-        note = "Medians. Hardware and program differ, so times compare within a column only."
-        yield Table("Effort of the searches", columns, tuple(rows), note)
-
-
-def _circumstance_table(view: views.DatasetView) -> Table:
+def _circumstances(view: views.DatasetView) -> Facts:
+    """What differs between the recordings here and the published ones, as far as it is known."""
     runs, split = view.dataset.split(view.scored), view.scored
-    origin = "simulated" if view.dataset.simulated else "recorded by another robot, or at another time"
     systematic, _ = scatter_parts(view.design_errors[split], runs)
     lengths = [run.distance or float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in runs]
-    rows = [
-        Row.of("Data", Cell(origin, plural(len(runs), f"{views.SPLIT_NAMES[split]} run")), NOTHING),
-        Row.of("Distance of a run, mean", f"{fixed(float(np.mean(lengths)), 2)} m", "not known"),
-        Row.of("Miss of a command's mean end by the design values", fixed(systematic, 4), "not known"),
-        Row.of("Odometry", "exact arcs" if view.config.integration == "arc" else "Euler steps", "Euler steps, Eq. (1)"),
+    origin = "simulated" if view.dataset.simulated else "recorded by another robot, or at another time"
+    odometry = "exact arcs" if view.config.integration == "arc" else "Euler steps"
+    facts = [
+        Fact("Data", origin, view.runs_in_words(split)),
+        Fact("Distance of a run, mean", f"{fixed(float(np.mean(lengths)), 2)} m"),
+        Fact("Miss of a command's mean end by the design values", fixed(systematic, 4)),
+        Fact("Odometry", odometry, "published: Euler steps, Eq. (1)"),
     ]
-    best = view.best
-    errors = None if best is None or best.typical is None else view.errors(best.typical, split)
-    if best is not None and errors is not None and (reached := best.cost(split)) is not None:
+    errors = view.errors(view.best, split)
+    if view.best is not None and errors is not None:
         _, scatter = scatter_parts(errors, runs)
-        share = "" if scatter is None else f"{percent(scatter / reached.value, 0)} of the cost"
-        here = Cell(fixed(scatter, 4), share) if scatter is not None else "no command was repeated"
-        rows.append(Row.of("Scatter of a command's repetitions, which no matrix removes", here, "not known"))
-    columns = (Column("Circumstance", numeric=False), Column("Here", numeric=False), Column("Published", numeric=False))
-    return Table("In which circumstances", columns, tuple(rows))
+        share = "" if scatter is None else f"{percent(scatter / view.best.costs[split].value, 0)} of the cost"
+        here = "no command was repeated" if scatter is None else fixed(scatter, 4)
+        facts.append(Fact("Scatter of a command's repetitions, which no matrix removes", here, share))
+    return Facts(tuple(facts))
 
 
 def scatter_parts(errors: Array, runs: Sequence[Trajectory]) -> tuple[float | None, float | None]:
@@ -277,17 +265,20 @@ def scatter_parts(errors: Array, runs: Sequence[Trajectory]) -> tuple[float | No
 
 def paper_paths(view: views.DatasetView) -> Iterator[FigureGrid]:
     """Fig. 6 and 7: paths of the paper's four commands by the design values and its methods here."""
-    runs = [run for degrees in _DIRECTIONS if (run := _commanded(view.dataset.split(view.scored), degrees)) is not None]
-    if len(runs) < len(_DIRECTIONS) or not view.published_entries:
+    chosen: dict[int, Trajectory] = {}
+    for run in view.dataset.split(view.scored):
+        turning = math.isclose(run.omega or 0.0, _TURN_RATE, abs_tol=1e-3)
+        if run.alpha is not None and turning and moves(run):
+            chosen.setdefault(round(direction_of(run)), run)
+    if not set(_DIRECTIONS) <= chosen.keys() or not view.published_entries:
         return
-    models = [(views.THEORETICAL_STYLE, view.model(view.design_matrix))]
+    models = [(views.THEORETICAL_STYLE, view.model())]
     for result, entry, typical in view.published_entries:
         style = view.styles[entry.label]
         item = replace(style, label=f"{style.label}, as the paper's {result.label}")
-        assert typical.matrix is not None  # published entries have answers
         models.append((item, view.model(typical.matrix, typical.result.extension)))
     figures = []
-    for run in runs:
+    for run in map(chosen.__getitem__, _DIRECTIONS):
         reference = run.poses[evenly(len(run.poses), 2 * _POINTS)]
         traces = [path(REFERENCE_ITEM, reference, 3.5), marks(REFERENCE_ITEM, 9, *reference[-1:, :2].T)]
         for item, model in models:
@@ -299,57 +290,75 @@ def paper_paths(view: views.DatasetView) -> Iterator[FigureGrid]:
     yield FigureGrid(tuple(figures), items, 2, "As Fig. 6 and 7 of the paper.", "paths-of-the-paper")
 
 
-def _commanded(runs: Sequence[Trajectory], degrees: float) -> Trajectory | None:
-    for run in runs:
-        off = abs(math.degrees(run.alpha or 0.0) % 360 - degrees)
-        if off < 0.5 and math.isclose(run.omega or 0.0, _TURN_RATE, abs_tol=1e-3) and moves(run):
-            return run
-    return None
-
-
 def flower_figures(view: views.DatasetView) -> Iterator[FigureGrid]:
     """Mean final position error by commanded direction and rate of turn, before and after.
 
     Nothing where fewer than three directions were driven at each of a few speeds and rates of turn.
     """
-    runs, best = view.dataset.split(view.scored), view.best
-    after = None if best is None or best.typical is None else view.errors(best.typical, view.scored)
-    moving = [index for index, run in enumerate(runs) if run.alpha is not None and run.omega is not None and moves(run)]
-    motions = sorted({motion_of(runs[index]) for index in moving})
-    directions = [{round(direction_of(runs[i])) % 360 for i in moving if motion_of(runs[i]) == m} for m in motions]
-    few = not moving or len(motions) > MOST_MOTIONS or min(map(len, directions)) < 3
+    groups: dict[Motion, dict[int, list[int]]] = {}
+    for index, run in enumerate(view.dataset.split(view.scored)):
+        if run.alpha is not None and run.omega is not None and moves(run):
+            groups.setdefault(motion_of(run), {}).setdefault(round(direction_of(run)) % 360, []).append(index)
+    few = not groups or len(groups) > MOST_MOTIONS or min(map(len, groups.values())) < 3
+    best, after = view.best, view.errors(view.best, view.scored)
     if best is None or after is None or few or not np.isfinite(after).all():
         return
-    legend = motion_items(motions)
-    errors = [np.hypot(*each[:, :2].T) for each in (view.design_errors[view.scored], after)]
-    factor, unit, _ = views.position_unit(float(errors[0].max()))
-    titles = ("design values", best.label)
-    figures = [
-        Figure(
-            f"Mean final position error ({unit}), {title}",
-            _by_direction(runs, moving, motions, factor * of_model, 1.08 * factor * float(errors[0].max()), unit),
-            f"Mean final position error in {unit} by direction of motion and rate of turn, {title}",
-            300,
-        )
-        for title, of_model in zip(titles, errors, strict=True)
-    ]
+    items, largest = motion_items(sorted(groups)), float(np.hypot(*view.design_errors[view.scored][:, :2].T).max())
+    factor, unit, _ = views.position_unit(largest)
+    figures = []
+    for title, of_model in (("design values", view.design_errors[view.scored]), (best.label, after)):
+        traces, errors = [], factor * np.hypot(*of_model[:, :2].T)
+        for item, motion in zip(items, sorted(groups), strict=True):
+            means = {angle: float(errors[groups[motion][angle]].mean()) for angle in sorted(groups[motion])}
+            ways = np.radians([*means, min(means)])  # the outline is closed
+            x, y = np.array([*means.values(), means[min(means)]]) * np.array([-np.sin(ways), np.cos(ways)])
+            words = [f"{item.label}, α {angle}°: {mean:.3g} {unit}" for angle, mean in means.items()]
+            traces += [line(item, 2.0, x, y), marks(item, 5, x[:-1], y[:-1], hover="%{text}", words=words)]
+        window = 1.08 * factor * largest * np.array([[-1.0, 1.0]] * 2)
+        figure = plan(*traces, window=window, x_title=f"to the right ({unit})", y_title=f"ahead ({unit})")
+        name = f"Mean final position error ({unit}), {title}"
+        figures.append(Figure(name, figure, f"{name}, by direction of motion and rate of turn", 300))
     caption = "Distance from the middle: mean error over repetitions, along the commanded direction, forward up."
-    yield FigureGrid(tuple(figures), tuple(legend), 2, caption, "errors-by-direction")
+    yield FigureGrid(tuple(figures), tuple(items), 2, caption, "errors-by-direction")
 
 
-def _by_direction(
-    runs: Sequence[Trajectory], moving: Sequence[int], motions: Sequence[Motion], errors: Array, limit: float, unit: str
-) -> go.Figure:
-    """Mean error of each motion as the distance from the middle along its commanded direction, forward up."""
-    traces = []
-    for motion, item in zip(motions, motion_items(motions), strict=True):
-        rows = np.array([index for index in moving if motion_of(runs[index]) == motion])
-        angles = np.array([direction_of(runs[index]) for index in rows])
-        unique = np.unique(angles)
-        means = np.array([errors[rows[angles == angle]].mean() for angle in unique])
-        along = np.radians(np.append(unique, unique[0]))
-        x, y = np.append(means, means[0]) * np.array([-np.sin(along), np.cos(along)])
-        words = [f"{item.label}, α {angle:.0f}°: {mean:.3g} {unit}" for angle, mean in zip(unique, means, strict=True)]
-        traces += [line(item, 2.0, x, y), marks(item, 5, x[:-1], y[:-1], hover="%{text}", words=words)]
-    window = limit * np.array([[-1.0, 1.0]] * 2)
-    return plan(*traces, window=window, x_title=f"to the right ({unit})", y_title=f"ahead ({unit})")
+def _fig_4(view: views.DatasetView) -> Iterator[FigureGrid]:
+    """Fig. 4 of the paper with the settings of its genetic algorithm here: the search as a loop of boxes."""
+    genetic = next((run.record for _, entry, run in view.published_entries if entry.calibrator == "genetic"), None)
+    if genetic is None:
+        return
+    options = GeneticOptions.model_validate(genetic.options)
+    population = options.size(3 * len(view.dataset.robot.drive.names) - len(genetic.held))
+    bounds = "±10 % of V" if genetic.box == "paper" else f"box {genetic.box}"
+    # Middles of the boxes, in two columns that a phone and half a sheet of paper can hold, and what stands in them
+    boxes = (
+        (1, 3, f"<b>Initial population</b><br>V, the design values,<br>and {population - 1} random ones"),
+        (1, 2, f"<b>Population of {population}</b><br>V<sub>LB</sub>, V<sub>UB</sub>: {bounds}"),
+        (1, 1, f"<b>Odometry</b><br>{plural(len(view.dataset.split('train')), 'training run')}"),
+        (1, 0, f"<b>Cost</b><br>{view.config.objective},<br>Eq. (6)"),
+        (0, 0, f"<b>Stop?</b> best changes<br>≤ {options.tolerance:g} on average of<br>"
+               f"{options.stall_generations} generations, or<br>{count(view.config.budget.evaluations)} evaluations"),
+        (0, 1, f"<b>Selection</b><br>elite {percent(options.elite, 0)} unchanged,<br>parents by rank"),
+        (0, 2, f"<b>Crossover</b> of {percent(options.crossover, 0)}<br><b>Mutation</b> of the others<br>"
+               f"({options.mutation.replace('_', ' ')})"),
+    )  # fmt: skip
+    looks = {
+        "bordercolor": AXIS,
+        "borderwidth": 1,
+        "borderpad": 6,
+        "bgcolor": "white",
+        "width": 156,
+        "showarrow": False,
+    }
+    notes: list[dict[str, Any]] = [{"x": x, "y": y, "text": words, "width": 156, **looks} for x, y, words in boxes]
+    for (x, y, _), (to_x, to_y, _) in pairwise((*boxes, boxes[1])):
+        gap = 87 if y == to_y else 38  # px from the middle of a box to its side, or its top
+        ends = {"x": to_x, "y": to_y, "ax": x, "ay": y, "standoff": gap, "startstandoff": gap, "text": ""}
+        frames = {"xref": "x", "yref": "y", "axref": "x", "ayref": "y"}
+        notes.append({**ends, **frames, "showarrow": True, "arrowhead": 2, "arrowwidth": 1.4, "arrowcolor": INK})
+    figure = plot(go.Scatter(x=[-0.5, 1.5], y=[-0.5, 3.5], mode="markers", marker_opacity=0, hoverinfo="skip"))
+    hidden = {"visible": False}
+    figure.update_layout(annotations=notes, xaxis=hidden, yaxis=hidden, margin_l=10, margin_b=10, font_size=12)
+    words = "Initial population, odometry, cost; then stop, or selection, crossover and mutation"
+    picture = Figure("How the genetic search runs", figure, words, 500)
+    yield FigureGrid((picture,), (), 1, f"Fig. 4 of the paper, with the settings of {genetic.label}.", "fig-4")

@@ -1,242 +1,169 @@
-"""Tables of a data set's results: the answer in brief, costs, final errors, entries, runs, matrices."""
+"""Tables of a comparison: costs and errors, how fits ended, ratios of methods in cells, matrices, data."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from omnibench.compare.config import THEORETICAL_NAME
+from omnibench.compare.config import AS_RECORDED, THEORETICAL_NAME
+from omnibench.compare.plan import ComparedRobot
 from omnibench.compare.report import view as views
-from omnibench.compare.result import EntryStatistics, RunRecord
-from omnibench.data.dataset import Split
+from omnibench.compare.result import Cell as MethodCell
+from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredFit, mean_ratio
+from omnibench.data.dataset import SPLITS, Split
 from omnibench.fit.evaluate import positions_and_headings
+from omnibench.fit.intervals import Interval
 from omnibench.fit.span import driven_span
 from omnibench.registry import costs
 from omnibench.report.blocks import Block, Cell, Code, Column, Row, RowRole, Table
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listing, percent, seconds, significant
 from omnibench.robot.kinematics import Array, relative_deviations
-from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
 
-
-def answer_table(view: views.DatasetView) -> Table:
-    """Every entry on the runs that are scored, in a line each: cost, improvement, final errors, verdict."""
-    split, decimals = view.scored, view.cost_decimals
-    rows = []
-    for entry in sorted(view.statistics, key=lambda entry: (cost := entry.cost(split)) is None or cost.value):
-        reached, run = entry.cost(split), entry.typical
-        errors = None if run is None else view.errors(run, split)
-        position, heading = (np.nan, np.nan) if errors is None else map(_mean, positions_and_headings(errors))
-        rows.append(
-            Row.of(
-                entry.label,
-                fixed(None if reached is None else reached.value, decimals),
-                views.interval_cell(reached, decimals),
-                views.improvement_cells(entry, split, 1)[0],
-                fixed(1e3 * position, 1),
-                fixed(math.degrees(heading), 2),
-                _verdict(view, entry).text,
-                role="best" if entry.is_best else "plain" if entry.answers else "failed",
-            )
-        )
-    number = plural(len(view.dataset.split(split)), f"{views.SPLIT_NAMES[split]} run")
-    return Table(
-        f"{view.name}{' (simulated)' if view.dataset.simulated else ''}: {number}, cost {view.config.objective}",
-        (
-            Column("Entry", numeric=False),
-            Column("Cost"),
-            Column("95 % interval", priority=4),
-            Column("Improvement", priority=1),
-            Column("Position", "mm", priority=2),
-            Column("Heading", "°", priority=3),
-            Column("Verdict", numeric=False),
-        ),
-        tuple(rows),
-    )
+_BROKEN = 1.5  # times the method's own error as recorded, from which on it counts as broken; chosen
 
 
-def _mean(values: Array) -> float:
-    return views.mean_and_worst(values)[0]
+def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) -> Table:
+    """Cost, improvement, final errors and verdict of every entry on a split, the design values first.
 
-
-def cost_words(view: views.DatasetView) -> str:
-    """The cost's name and its summary, and the loss, if it is a robust one."""
-    words = f"{view.config.cost_name}: {costs.entry(view.config.cost_name).summary.rstrip('.')}."
-    if view.config.loss == "squares":
-        return words
-    return f"{words} It was fitted with the loss {view.config.loss}; figures here are without it."
-
-
-def cost_table(view: views.DatasetView, split: Split) -> Table:
-    """Table 2 (training) or 3 (validation) of the paper, with intervals."""
-    decimals = view.cost_decimals
-    before = fixed(view.theoretical_cost(split), decimals)
-    design = Cell(before, views.interval_cell(view.design_costs.get(split), decimals))
-    rows = [Row.of(view.entry_cell(None), design, NOTHING, NOTHING)]
-    for entry in view.statistics:
-        reached = entry.cost(split)
-        if entry.calibrator == THEORETICAL_NAME:
-            continue
-        if reached is None:
-            outcome = next(run.record.outcome.value for run in view.runs if run.record.label == entry.label)
-            cells = (before, Cell("no answer", outcome), NOTHING)
-            rows.append(Row.of(view.entry_cell(entry), *cells, role="failed"))
-            continue
-        cost = Cell(fixed(reached.value, decimals), views.interval_cell(reached, decimals))
-        improvement = Cell(*views.improvement_cells(entry, split, 2))
-        role: RowRole = "best" if entry.is_best else "plain"
-        rows.append(Row.of(view.entry_cell(entry), before, cost, improvement, role=role))
-    published = [(result, ends) for result in view.config.published_results if (ends := result.costs(split))]
-    if published:
+    brief: a line an entry, without worst errors, differences and the rows of Table 2 or 3 of the paper.
+    """
+    asked = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
+    asked.sort(key=lambda entry: entry.costs[split].value if split in entry.costs else math.inf)
+    design = next((entry for entry in view.statistics if entry.calibrator == THEORETICAL_NAME), None)
+    lines: list[tuple[EntryStatistics | None, Interval | None, Array | None]] = []
+    lines.append((design, view.design_costs.get(split), view.design_errors[split]))
+    lines += [(entry, entry.costs.get(split), view.errors(entry, split)) for entry in asked]
+    means = [np.nan if of is None else views.mean_and_worst(positions_and_headings(of)[0])[0] for *_, of in lines]
+    factor, unit, digits = views.position_unit(*means)
+    rows, decimals = [], view.cost_decimals
+    for entry, cost, errors in lines:
+        improvement = None if entry is design or entry is None else entry.improvements.get(split)
+        positions, headings = (np.array([]),) * 2 if errors is None else positions_and_headings(errors)
+        position, worst = (fixed(factor * value, digits) for value in views.mean_and_worst(positions))
+        heading, most = (fixed(np.degrees(value), 2) for value in views.mean_and_worst(headings))
+        difference = ("", "")
+        if split == view.scored and entry is not None and entry.difference is not None and not entry.is_best:
+            difference = views.difference_cells(entry.difference)
+        label, role = THEORETICAL_NAME if entry is None else entry.label, row_role(entry)
+        colour = views.THEORETICAL_STYLE if entry is design else view.styles[label]
+        reached = fixed(None if cost is None else cost.value, decimals), views.interval_cell(cost, decimals)
+        fell, said = views.improvement_cells(improvement, 2), "" if entry is None else verdict(view, entry)
+        cells = [Cell(*reached), Cell(*fell), Cell(position, f"worst {worst}"), Cell(heading, f"worst {most}")]
+        shown: list[Cell | str] = [*reached, fell[0], position, heading] if brief else [*cells, Cell(*difference)]
+        rows.append(Row.of(Cell(label, "", colour.colour), *shown, said, role=role))
+    of_paper = [(result, ends) for result in view.config.published_results if (ends := result.costs(split))]
+    if of_paper and not brief:
         rows.append(Row.of("Published, on other data: not comparable row by row", role="group"))
-    for result, (theirs, after) in published:
-        shown = (fixed(theirs, 4), fixed(after, 4), percent(result.improvement(split), 2))
-        rows.append(Row.of(Cell(result.label, result.source), *shown, role="muted"))
-    number = plural(len(view.dataset.split(split)), f"{views.SPLIT_NAMES[split]} run")
-    paper = f"As Table {2 if split == 'train' else 3} of the paper. " if view.of_the_paper else ""
-    return Table(
-        f"Cost of {number}",
-        (
-            Column("Entry", numeric=False),
-            Column("Cost, design values", priority=1),
-            Column(f"Cost, {views.SPLIT_NAMES[split]}"),
-            Column("Improvement"),
-        ),
-        tuple(rows),
-        f"{paper}The cost is {cost_words(view)} Small print: 95 % intervals, {view.units(split).ratio_words}, of the "
-        "run with the median training cost.",
+        for result, (before, after) in of_paper:
+            theirs = Cell(fixed(after, 4), f"from {fixed(before, 4)}"), percent(result.improvement(split), 2)
+            rows.append(Row.of(Cell(result.label, result.source), *theirs, *[""] * 4, role="muted"))
+    errors_of = (Column("Position", unit, priority=2), Column("Heading", "°", priority=3))
+    middle = (Column("Cost"), Column("Improvement", priority=1), *errors_of, Column("Difference from the best"))
+    if brief:
+        middle = (Column("Cost"), Column("95 % interval", priority=4), Column("Improvement", priority=1), *errors_of)
+    name = f"{view.name}{' (simulated)' if view.dataset.simulated else ''}"
+    title = f"{name}: {view.runs_in_words(split)}, cost {view.config.objective}"
+    return Table(title, (Column("Entry", numeric=False), *middle, Column("Verdict", numeric=False)), tuple(rows))
+
+
+def row_role(entry: EntryStatistics | None) -> RowRole:
+    """The role of an entry's row; None stands for the design values."""
+    return "plain" if entry is None else "best" if entry.is_best else "plain" if entry.answers else "failed"
+
+
+def cost_note(view: views.DatasetView) -> str:
+    """What costs, differences and verdicts mean."""
+    name, units = view.config.cost_name, view.units(view.scored)
+    loss = f" It was fitted with the loss {view.config.loss}; figures here are without it."
+    loss = "" if view.config.loss == "squares" else loss
+    paper = "As Tables 2 and 3 of the paper. " if view.config.published_results else ""
+    return (
+        f"{paper}The cost is {name}: {costs.entry(name).summary.rstrip('.')}."
+        f"{loss} Intervals: {units.ratio_words}, of the run of median training cost; differences are paired by "
+        f"{units.name}. Not told apart: the difference may be chance, or is below a "
+        "tenth of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
+        "not known to differ from the one of lowest cost on the runs that judge."
     )
 
 
-def final_error_table(view: views.DatasetView, split: Split) -> Table:
-    """Mean and worst final errors in position and heading, design values first."""
-    errors: list[tuple[EntryStatistics | None, Array]] = [(None, view.design_errors[split])]
-    errors += [(entry, after) for entry, run in view.calibrated if (after := view.errors(run, split)) is not None]
-    factor, unit, decimals = views.position_unit(*(_mean(positions_and_headings(rows)[0]) for _, rows in errors))
-    rows = []
-    for entry, of_entry in errors:
-        positions, headings = positions_and_headings(of_entry)
-        cells = [fixed(factor * value, decimals) for value in views.mean_and_worst(positions)]
-        cells += [fixed(np.degrees(value), 2) for value in views.mean_and_worst(headings)]
-        role: RowRole = "best" if entry is not None and entry.is_best else "plain"
-        rows.append(Row.of(view.entry_cell(entry), *cells, role=role))
-    places = (Column("position, mean", unit), Column("position, worst", unit))
-    columns = (Column("Entry", numeric=False), *places, Column("heading, mean", "°"), Column("heading, worst", "°"))
-    return Table(f"Error of the final pose, {views.SPLIT_NAMES[split]} runs", columns, tuple(rows))
-
-
-def entry_table(view: views.DatasetView) -> Table:
-    """The entries: costs over their seeds, and the difference from the best."""
-    split = view.scored
-    rows = []
-    for entry in view.statistics:
-        spread = "" if entry.train_spread is None else f"spread {significant(entry.train_spread, 2)}"
-        spread = "one seed" if entry.answers == 1 else spread
-        difference = Cell(NOTHING)
-        if entry.difference is not None and not entry.is_best:
-            difference = Cell(*views.difference_cells(entry.difference))
-        time = view.time_in_words(entry.seconds_median, entry.reference_evaluations_median)
-        rows.append(
-            Row.of(
-                view.entry_cell(entry),
-                f"{entry.answers} of {entry.runs}",
-                Cell(fixed(entry.train_median, decimals_for(entry.train_median, 5)), spread),
-                Cell(_gap(entry.gap_median), _proven(entry.proven_gap_median)),
-                Cell(count(entry.evaluations_median), time),
-                difference,
-                _verdict(view, entry),
-                role="best" if entry.is_best else "plain" if entry.answers else "failed",
-            )
-        )
-    untimed = "" if view.config.timing else " The runs were not timed."
-    if view.config.timing and not view.times_compare:
-        untimed = " Runs were made on machines of different speed: times are in evaluations of the start's cost there."
-    return Table(
-        "Entries over their seeds",
-        (
-            Column("Entry", numeric=False),
-            Column("Answers of runs", priority=1),
-            Column("Cost, training, median"),
-            Column("Gap above closed_form", "relative", priority=2),
-            Column("Evaluations and time, median", priority=3),
-            Column(f"Difference from the best in {views.SPLIT_NAMES[split]} cost"),
-            Column("Verdict", numeric=False),
-        ),
-        tuple(rows),
-        f"Spread: interquartile range over seeds. Gap: of the same box; {NOTHING} where closed_form has no answer or "
-        "leaves no error. Proven: the share of the cost that any optimiser could still save in that box, at most. "
-        f"Difference: paired by {view.units(split).name}, with its 95 % interval, {view.units(split).ratio_words}. Not "
-        "told apart: it contains zero, or the difference is below a tenth of the standard error of the best entry's "
-        "cost. Best: the lowest training cost of the entries that are not known to differ from the one of lowest "
-        f"{views.SPLIT_NAMES[split]} cost.{_held(view)}{untimed}",
-    )
-
-
-def _verdict(view: views.DatasetView, entry: EntryStatistics) -> Cell:
+def verdict(view: views.DatasetView, entry: EntryStatistics) -> str:
+    """The verdict on an entry in a few words."""
     if entry.typical is None:
-        return Cell("no answer")
+        return "no answer"
     if entry.is_best:
-        return Cell("lowest training cost" if view.undecided else "best", views.rivals_cell(view))
+        return "lowest training cost" if view.undecided else "best"
     if entry.practically_equal is None or entry.difference is None:
-        return Cell("undecided", view.units(view.scored).ratio_words)
+        return "undecided"
     if entry in view.rivals:
-        return Cell("not told apart")
-    if entry.practically_equal:  # the design values, as the headline has them
-        return Cell("worse", "by its share of the cost")
-    return Cell("worse") if entry.difference.value > 0 else Cell("lower cost here", "higher training cost")
+        return "not told apart"
+    # The design values may be practically equal, and yet the best one's improvement on them more than chance
+    return "worse" if entry.practically_equal or entry.difference.value > 0 else "lower cost here"
 
 
-def _held(view: views.DatasetView) -> str:
-    """A sentence on elements that a box without width holds at the design value."""
-    held: dict[str, list[str]] = {}
-    for entry, run in view.calibrated:
-        if run.record.held and entry.parameterisation == "matrix":
-            held.setdefault(", ".join(run.record.held), []).append(entry.label)
-    words = "; ".join(f"{names} ({listing(labels)})" for names, labels in held.items())
-    return f" Held at the design value by a box without width there: {words}." if words else ""
+def outcome_table(result: ComparisonResult, fits: Sequence[ScoredFit], *, every: bool = False) -> Table:
+    """How fits ended, what they took, and of data sets costs, gaps and bounds: an entry in a line, or ``every`` fit."""
+    groups: dict[tuple[str, str, int], list[ScoredFit]] = {}
+    for number, run in enumerate(fits):
+        groups.setdefault((run.fit.robot.name, run.fit.label, number if every else 0), []).append(run)
+    machines = {run.result.timing.machine for run in fits if run.result.timing}
+    rows, last, of_sets = [], "", bool(result.config.datasets)
+    for (robot, label, _), group in groups.items():
+        if robot != last and len(result.robots) > 1 and not of_sets:
+            rows.append(Row.of(robot, role="group"))
+        last, answered = robot, [run for run in group if run.errors is not None]
+        outcomes = Counter(run.result.outcome.replace("_", " ") for run in group)
+        spent = [run.result.seconds for run in (group if of_sets else answered)]
+        timings = [run.result.seconds / t.reference_seconds for run in group if (t := run.result.timing)]
+        time = seconds(float(np.median(spent))) if spent else NOTHING
+        if len(machines) > 1:
+            time = f"{count(float(np.median(timings)))} of the start" if timings else NOTHING
+        cells: list[Cell | str] = [
+            Cell(label, f"seed {group[0].record.seed}" if every else f"{len(answered)} of {len(group)} answered"),
+            Cell(", ".join(f"{n} {each}" if len(group) > 1 else each for each, n in outcomes.items())),
+            count(float(np.median([run.result.evaluations for run in group]))),
+            time if result.config.timing else NOTHING,
+        ]
+        if of_sets:
+            cells += _costs_of([run.record for run in group])
+        reasons = list(dict.fromkeys(run.result.reason for run in (group if of_sets else (answered or group)[:1])))
+        rows.append(Row.of(*cells, listing(reasons, 2), role="plain" if answered else "failed"))
+    note = "Medians over fits." if not every else ""
+    if of_sets:
+        note += f" Gap: above closed_form in the same box; {NOTHING} where that has no answer or leaves no error."
+        note += " Proven: the share of the cost that any optimiser could still save in that box, at most."
+    note += "" if result.config.timing else " The runs were not timed."
+    if len(machines) > 1 and result.config.timing:
+        note += " Runs were made on machines of different speed: times are in evaluations of the start's cost there."
+    columns = [Column("Entry", numeric=False), Column("Outcome", numeric=False), Column("Evaluations", priority=2)]
+    columns.append(Column("Time", priority=3))
+    if of_sets:
+        columns += [Column("Cost, training"), Column("Cost, held-out", priority=1), Column("Gap", priority=1)]
+        columns.append(Column("On a bound", numeric=False, priority=4))
+    columns.append(Column("What it says", numeric=False, priority=2))
+    return Table("Every run" if every else "Outcomes and time", tuple(columns), tuple(rows), note.strip())
 
 
-def run_table(view: views.DatasetView) -> Table:
-    """Every run, those without an answer with their reasons."""
-    rows = []
-    for record in (run.record for run in view.runs):
-        digits = decimals_for(record.train_cost, 5)
-        failed = record.matrix is None
-        marks = [name for name in record.at_bounds if name not in record.held]
-        rows.append(
-            Row.of(
-                Cell(record.label, "" if record.label == record.calibrator else record.calibrator),
-                str(record.seed),
-                Cell(record.outcome.value.replace("_", " "), record.reason),
-                fixed(record.train_cost, digits),
-                fixed(record.validation_cost, digits),
-                Cell(_gap(record.gap), _proven(record.proven_gap)),
-                Cell(count(record.evaluations), view.time_in_words(record.seconds, _references(record))),
-                ", ".join(marks) or NOTHING,
-                role="failed" if failed else "plain",
-            )
-        )
-    return Table(
-        "Every run",
-        (
-            Column("Entry", numeric=False),
-            Column("Seed", priority=2),
-            Column("Outcome", numeric=False),
-            Column("Cost, training"),
-            Column("Cost, held-out"),
-            Column("Gap", priority=1),
-            Column("Evaluations and time", priority=2),
-            Column("On a bound", numeric=False, priority=3),
-        ),
-        tuple(rows),
-    )
+def _costs_of(records: Sequence[RunRecord]) -> Iterator[Cell | str]:
+    """Median costs and gaps of some runs with their spread, and the elements that searches moved to a bound."""
 
+    def known(name: str) -> list[float]:
+        return [value for record in records if (value := getattr(record, name)) is not None]
 
-def _references(record: RunRecord) -> float | None:
-    return record.seconds / record.reference_seconds if record.reference_seconds else None
+    train, held_out, gaps, proofs = map(known, ("train_cost", "validation_cost", "gap", "proven_gap"))
+    digits = decimals_for(float(np.median(train)) if train else None, 5)
+    spread = significant(float(np.subtract(*np.percentile(train, [75, 25]))), 2) if len(train) > 1 else ""
+    yield Cell(fixed(float(np.median(train)), digits) if train else NOTHING, spread and f"spread {spread}")
+    yield fixed(float(np.median(held_out)), digits) if held_out else NOTHING
+    gap = float(np.median(gaps)) if gaps else None
+    left = f"proven: ≤ {percent(max(float(np.median(proofs)), 0.0), 2)}" if proofs else ""
+    yield Cell("0" if gap is not None and abs(gap) < 5e-13 else significant(gap, 2), left)  # below it: rounding
+    bounds = dict.fromkeys(name for record in records for name in record.at_bounds if name not in record.held)
+    yield ", ".join(bounds) or NOTHING
 
 
 def certificate_table(view: views.DatasetView) -> Iterator[Table]:
@@ -249,129 +176,219 @@ def certificate_table(view: views.DatasetView) -> Iterator[Table]:
             Cell(percent(each.gap, 2), "" if each.finished else "time or parts ran out"),
             Cell(count(each.parts), seconds(each.seconds)),
         )
-        for each in view.certificates
+        for each in view.result.certificates
+        if each.dataset == view.name
     ]
-    titles = ("Lowest training cost found", "No matrix of the box is below", "Left to gain, at most")
-    columns = (Column("Box", numeric=False), *map(Column, titles), Column("Parts of the box, time"))
+    titles = ("Lowest training cost found", "No matrix of the box is below", "Left to gain, at most", "Parts, time")
     note = "Proven by branch and bound on row 3 of the matrix, with rounding counted in, whichever search is used."
     if rows:
+        columns = (Column("Box", numeric=False), *map(Column, titles))
         yield Table("What no optimiser can beat", columns, tuple(rows), note)
 
 
-def _gap(value: float | None) -> str:
-    """A relative gap; 0 where it is smaller than rounding."""
-    return "0" if value is not None and abs(value) < 5e-13 else significant(value, 2)
+def matrix_table(view: views.DatasetView, against: str | None = None, labels: Sequence[str] = ()) -> Table:
+    """Matrices of typical answers, below each element its difference from the design's, or from the entry ``against``.
 
-
-def _proven(value: float | None) -> str:
-    return "" if value is None else f"proven: ≤ {percent(max(value, 0.0), 2)}"
-
-
-def matrix_blocks(view: views.DatasetView) -> Iterator[Block]:
-    """Matrices, their differences from the design values and from the reference entry, parameters, all digits."""
-    names = [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, len(view.dataset.robot.drive.names) + 1)]
-    rows = [Row.of(view.entry_cell(None), *(fixed(float(v), 6) for v in view.design_matrix.ravel()))]
-    for entry, run in view.calibrated:
-        if run.matrix is not None:
-            marks = _marks(run.record) if entry.parameterisation == "matrix" else {}
-            values = zip(names, run.matrix.ravel(), strict=True)
-            cells = [fixed(float(value), 6) + marks.get(name, "") for name, value in values]
-            rows.append(Row.of(view.entry_cell(entry), *cells, role="best" if entry.is_best else "plain"))
-    units = ["rad/rad" if name.startswith("m3") else "m/rad" for name in names]
-    yield Table(
-        "Inverse kinematic matrices M⁻¹",
-        (Column("Entry", numeric=False), *map(Column, names, units)),
-        tuple(rows),
-        f"Columns of each row: {', '.join(view.dataset.robot.drive.names)}. † on a bound of its box; ‡ held by the "
-        "box, which has no width there.",
-    )
-    reference, labels = view.reference_entry, [entry.label for entry, _ in view.calibrated]
-    yield difference_table(view, None, labels)
-    if reference is not None and len(labels) > 1:
-        yield difference_table(view, reference.label, [label for label in labels if label != reference.label])
-    of_paper = {entry.parameterisation: entry.label for _, entry, _ in view.published_entries}
-    if {"geometry", "matrix"} <= of_paper.keys():
-        yield difference_table(view, of_paper["matrix"], [of_paper["geometry"]])
-    if any(run.record.parameters for _, run in view.calibrated):
-        yield parameter_table(view)
-    # So many digits that reading them gives exactly the same numbers
-    named = [("theoretical", view.design_matrix)]
-    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
-    parts = []
-    for label, matrix in named:
-        lines = ",\n  ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in matrix)
-        parts.append(f"{json.dumps(label)}: [\n  {lines}]")
-    yield Code("\n".join(parts), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
-
-
-def difference_table(view: views.DatasetView, against: str | None, labels: list[str]) -> Table:
-    """Eq. (10), (11): differences of entries from the design values, or from the entry called ``against``."""
+    Eq. (10) and (11) of the paper. labels: of the entries that are shown; default: all.
+    """
     matrices = {entry.label: run.matrix for entry, run in view.calibrated if run.matrix is not None}
-    reference, robot = view.design_matrix if against is None else matrices[against], view.dataset.robot
+    robot = view.dataset.robot
+    reference = robot.inverse_kinematic_matrix if against is None else matrices[against]
     projector: Array | None = None
     if len(robot.drive.names) > len(robot.motions):  # across the span of what is driven a matrix is not determined
         driven = driven_span(view.dataset.split("train")).driven
         projector = driven.T @ driven
-    rows = []
-    for entry, _ in view.calibrated:
-        if entry.label not in labels or entry.label not in matrices:
+    names = [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, reference.shape[1] + 1)]
+    first = view.entry_cell(None) if against is None else Cell(against)
+    rows = [Row.of(first, *(fixed(float(value), 6) for value in reference.ravel()))]
+    for entry, run in view.calibrated:
+        if entry.label not in matrices or entry.label == against or (labels and entry.label not in labels):
             continue
-        moved = matrices[entry.label] - reference
-        moved = moved if projector is None else moved @ projector
+        matrix, marks = matrices[entry.label], bound_marks(run.record) if entry.parameterisation == "matrix" else {}
+        moved = matrix - reference if projector is None else (matrix - reference) @ projector
         shares = relative_deviations(reference + moved, reference).ravel()
         cells = []
-        for number, (share, change) in enumerate(zip(shares, moved.ravel(), strict=True)):
-            unit = "rad/rad" if number >= 2 * moved.shape[1] else "m/rad"
-            absolute = Cell("0" if abs(change) < 1e-15 else significant(float(change), 2, signed=True), unit)
-            cells.append(absolute if math.isnan(share) else Cell(f"{fixed(100 * float(share), 3, signed=True)} %"))
-        rows.append(Row.of(view.entry_cell(entry), *cells))
-    names = [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, reference.shape[1] + 1)]
+        for name, value, share, change in zip(names, matrix.ravel(), shares, moved.ravel(), strict=True):
+            absolute = "0" if abs(change) < 1e-15 else significant(float(change), 2, signed=True)
+            note = absolute if math.isnan(share) else f"{fixed(100 * float(share), 3, signed=True)} %"
+            cells.append(Cell(fixed(float(value), 6) + marks.get(name, ""), note))
+        rows.append(Row.of(view.entry_cell(entry), *cells, role="best" if entry.is_best else "plain"))
     return Table(
-        f"Differences from {'the design values' if against is None else against}",
-        (Column("Entry", numeric=False), *map(Column, names)),
+        f"Matrices M⁻¹ and their differences from {'the design values' if against is None else against}",
+        (Column("Entry", numeric=False), *(Column(n, "rad/rad" if n[1] == "3" else "m/rad") for n in names)),
         tuple(rows),
-        "Element by element, as a share of the value compared with, or the change itself where that is 0."
-        + (" Eq. (10) and (11) of the paper." if view.of_the_paper else "")
+        f"Columns of each row: {', '.join(robot.drive.names)}. Small print: the change as a share, or the change "
+        "itself where there is nothing to divide by. † on a bound of its box; ‡ held by a box without width there."
         + ("" if projector is None else " Compared on the span of drive signals that the data drive."),
     )
 
 
-def parameter_table(view: views.DatasetView) -> Table:
+def all_digits(view: views.DatasetView) -> Code:
+    """Matrices with so many digits that reading them gives exactly the same numbers."""
+    named = [("theoretical", view.dataset.robot.inverse_kinematic_matrix)]
+    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
+    lines = (f"{json.dumps(label)}: {json.dumps(matrix.tolist())}" for label, matrix in named)
+    return Code("\n".join(lines), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
+
+
+def parameter_table(view: views.DatasetView) -> Iterator[Table]:
     """Physical parameters of searched geometries and their deviation from the design values, as in section 4.2."""
-    fitted = [(entry, run.record) for entry, run in view.calibrated if run.record.parameters]
-    by_entry = [{each.name: each for each in record.parameters or ()} for _, record in fitted]
-    rows = []
-    for name in dict.fromkeys(name for parameters in by_entry for name in parameters):
-        known = next(parameters[name] for parameters in by_entry if name in parameters)
-        cells = [
-            _parameter_cell(parameters.get(name), _marks(record).get(name, ""))
-            for parameters, (_, record) in zip(by_entry, fitted, strict=True)
-        ]
-        rows.append(Row.of(name, _shown(known.design, known.unit), *cells))
-    return Table(
-        "Physical parameters and their deviation from the design values",
-        (Column("Parameter", numeric=False), Column("design"), *(Column(entry.label) for entry, _ in fitted)),
-        tuple(rows),
-        ("As section 4.2 of the paper. " if view.of_the_paper else "")
-        + "A geometry takes up whatever else is wrong with the model, so that a parameter by itself is no measurement "
-        "of the robot. † on a bound of its limits; ‡ held by limits without width.",
-    )
+    fitted = {entry.label: run.record for entry, run in view.calibrated if run.record.parameters}
+    by_name: dict[str, dict[str, Cell]] = {}
+    for label, record in fitted.items():
+        for each in record.parameters or ():
+            share, turned = each.deviation_percent, each.unit == "rad"
+            note = "design is 0" if share is None else f"{fixed(share, 2, signed=True)} %"
+            if turned:  # an angle's zero is a convention, so that no share of it means anything
+                note = f"{fixed(math.degrees(each.deviation), 3, signed=True)}°"
+            design, value = (
+                f"{fixed(math.degrees(number), 3)}°" if turned else f"{fixed(number, 5)} {each.unit}"
+                for number in (each.design, each.value)
+            )
+            mark = bound_marks(record).get(each.name, "")
+            by_name.setdefault(each.name, {"": Cell(design)})[label] = Cell(f"{value} {mark}".strip(), note)
+    rows = [Row.of(name, *(of.get(label, NOTHING) for label in ("", *fitted))) for name, of in by_name.items()]
+    if rows:
+        yield Table(
+            "Physical parameters and their deviation from the design values",
+            (Column("Parameter", numeric=False), Column("design"), *map(Column, fitted)),
+            tuple(rows),
+            "A geometry takes up whatever else is wrong with the model, so that a parameter by itself is no "
+            "measurement of the robot. † on a bound of its limits; ‡ held by limits without width.",
+        )
 
 
-def _marks(record: RunRecord) -> dict[str, str]:
+def bound_marks(record: RunRecord) -> dict[str, str]:
     """† for what a search moved to a bound, ‡ for what its box holds."""
     return {**dict.fromkeys(record.at_bounds, "†"), **dict.fromkeys(record.held, "‡")}
 
 
-def _shown(value: float, unit: str) -> str:
-    return f"{fixed(math.degrees(value), 3)}°" if unit == "rad" else f"{fixed(value, 5)} {unit}"
+def methods_table(result: ComparisonResult) -> Table:
+    """Every method on every robot: geometric mean over cells of its error as a share of the design's, or why none."""
+    robots, rows = [robot.name for robot in result.robots], []
+    for method in (entry.shown for entry in result.config.entries):
+        cells: list[Cell | str] = []
+        for robot in robots:
+            mine = [c for c in result.judged_cells if c.key.robot == robot and method in c.methods]
+            ratios = [share for cell in mine if (share := cell.share(method)) is not None]
+            mean, silent = mean_ratio(ratios), mine[0].methods[method].status if mine else NOTHING
+            cells.append(silent if mean is None else Cell(fixed(mean, 2), plural(len(ratios), "cell")))
+        rows.append(Row.of(method, *cells))
+    caption = "Mean error of runs that did not train, Eq. (6), as a share of the design's, geometric mean over cells"
+    return Table(caption, (Column("Method", numeric=False), *map(Column, robots)), tuple(rows))
 
 
-def _parameter_cell(parameter: PhysicalParameter | None, mark: str) -> Cell:
-    if parameter is None:
-        return Cell(NOTHING)
-    share = parameter.deviation_percent
-    deviation = "design is 0" if share is None else f"{fixed(share, 2, signed=True)} %"
-    if parameter.unit == "rad":  # an angle's zero is a convention, so that no share of it means anything
-        deviation = f"{fixed(math.degrees(parameter.deviation), 3, signed=True)}°"
-    return Cell(_shown(parameter.value, parameter.unit) + (mark and f" {mark}"), deviation)
+def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
+    """Every method in one cell, the least error first, those without an answer last."""
+    robot, judged = result.datasets[cell.key.robot].robot, len(result.judged_cells)
+    in_order = sorted(cell.methods.values(), key=lambda each: (each.errors is None, each.mean("cost") or 0.0))
+    rows, unit = [], ""
+    for number, each in enumerate(in_order):
+        name = Cell(each.method, "" if each.family == "other" else each.family)
+        ratio = cell.against_design(each.method, judged)
+        if ratio is None:
+            rows.append(Row.of(name, *[NOTHING] * 5, each.status, NOTHING, each.reason, role="failed"))
+            continue
+        found, unit = "", f"; intervals by {ratio.units}"
+        if each.matrix is not None:
+            shares = 100 * (each.matrix - robot.inverse_kinematic_matrix) / robot.row_scales[:, None]
+            changed = zip(("x", "y", "turn"), shares, strict=True)
+            found = "; ".join(f"{row} {', '.join(f'{v:+.1f}' for v in of_row)}" for row, of_row in changed)
+        partly = "" if each.answers == each.fits else f"{each.status}; else the design"
+        rows.append(
+            Row.of(
+                name,
+                fixed(each.mean("cost"), 4),
+                fixed(ratio.value, 3),
+                views.interval_cell(ratio.alone, 2),
+                fixed(1e3 * (each.mean("position") or 0.0), 1),
+                fixed(math.degrees(each.mean("heading") or 0.0), 2),
+                Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
+                seconds(each.seconds if result.config.timing else None),
+                Cell(each.numbers, found and f"matrix: {found} % of the row"),
+                role="plain" if number else "best",
+            )
+        )
+    numbers = (("run", cell.pairs.runs), ("calibration", cell.pairs.folds))
+    runs, folds = (plural(len(set(each.tolist())), word) for word, each in numbers)
+    columns = (
+        Column("Method", numeric=False),
+        Column("Cost"),
+        Column("of the design's"),
+        Column("95 % interval", priority=1),
+        Column("Position", "mm", priority=1),
+        Column("Heading", "°", priority=1),
+        Column("Verdict", numeric=False),
+        Column("Time", priority=2),
+        Column("What it found", numeric=False, priority=3),
+    )
+    note = (
+        f"Mean final errors, Eq. (6); {runs} of {plural(cell.pairs.sessions, 'session')} judge {folds}{unit}. "
+        f"Intervals are of this cell; verdicts hold for each method in {plural(judged, 'cell')} together."
+    )
+    return Table(f"{cell.key.robot}: {cell.key.within_robot}", columns, tuple(rows), note)
+
+
+def regime_table(result: ComparisonResult) -> Table:
+    """Which method breaks where: its error in each regime as a multiple of its own as recorded."""
+    places: dict[tuple[str, ...], dict[str, MethodCell]] = {}
+    for cell in result.cells:
+        if not cell.key.fitted:
+            places.setdefault((cell.key.robot, cell.key.training, cell.key.judged), {})[cell.key.regime] = cell
+    rows = []
+    for method in (entry.shown for entry in result.config.entries):
+        cells = []
+        for regime in result.config.regimes:
+            pairs = [(of[AS_RECORDED], of[regime]) for of in places.values() if {AS_RECORDED, regime} <= of.keys()]
+            means = [(a, b, worse) for usual, worse in pairs if (a := usual.mean(method)) and (b := worse.mean(method))]
+            mean = mean_ratio([b / a for a, b, _ in means])
+            broken = sum(b > _BROKEN * a for a, b, _ in means)
+            beyond = sum(b > float(cell.design["cost"].mean()) * (1 + 1e-9) for _, b, cell in means)
+            note = f"{broken} of {len(means)} break; {beyond} worse"
+            cells.append(Cell(NOTHING) if mean is None else Cell(fixed(mean, 2), note))
+        if any(cell.text != NOTHING for cell in cells):
+            rows.append(Row.of(method, *cells))
+    return Table(
+        "Error as a multiple of the method's own as recorded",
+        (Column("Method", numeric=False), *map(Column, result.config.regimes)),
+        tuple(rows),
+        f"Eq. (6), geometric mean over cells. Break: cells with more than {_BROKEN:g} times its own error as recorded; "
+        "worse: with more error than the design.",
+    )
+
+
+def data_table(robots: Sequence[ComparedRobot], broken: Mapping[str, str]) -> Table:
+    """Data sets, or robots, with their runs, sessions and trainings, and those whose recordings cannot be read."""
+    rows = []
+    for robot in robots:
+        dataset, runs = robot.dataset, robot.dataset.trajectories
+        sessions, commands = {run.session for run in runs} - {None}, {run.command for run in runs} - {None}
+        sizes = [f"{count(len(dataset.split(split)))} {views.SPLIT_NAMES[split]}" for split in SPLITS]
+        lasting = f"{significant(min(run.end for run in runs), 3)} to {significant(max(run.end for run in runs), 3)} s"
+        rows.append(
+            Row.of(
+                Cell(robot.name, "simulated" if dataset.simulated else "recorded"),
+                Cell(count(len(runs)), listing(sizes)),
+                Cell(lasting, f"samples every {significant(1e3 * dataset.sample_period, 3)} ms"),
+                count(len(commands)) if commands else "not known",
+                count(len(sessions)) if sessions else "not known",
+                listing([training.name for training in robot.trainings], 20),
+                Cell(dataset.source, dataset.licence),
+                Cell(dataset.description or dataset.name, f"SHA-256 {dataset.hash[:16]}"),
+            )
+        )
+    for name, reason in broken.items():
+        rows.append(Row.of(name, *[""] * 4, Cell("cannot be read", reason), "", "", role="failed"))
+    numbers = map(Column, ("Runs", "Duration of a run", "Commands", "Sessions"))
+    words = [Column(title, numeric=False) for title in ("Trainings", "Source", "Description")]
+    return Table("Recordings", (Column("Name", numeric=False), *numbers, *words), tuple(rows))
+
+
+def matrix_blocks(view: views.DatasetView) -> Iterator[Block]:
+    """Matrices beside the design's, Eq. (11) where the paper's two methods are here, parameters, all digits."""
+    yield matrix_table(view)
+    of_paper = {entry.parameterisation: entry.label for _, entry, _ in view.published_entries}
+    if {"geometry", "matrix"} <= of_paper.keys():
+        yield matrix_table(view, of_paper["matrix"], [of_paper["geometry"]])
+    yield from parameter_table(view)
+    yield all_digits(view)
