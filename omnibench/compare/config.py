@@ -7,12 +7,11 @@ judged runs by kind of path or session.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from omnibench.config import Model, NonNegative, Positive, RelativePath, printable, read_model, validate
 from omnibench.data.dataset import Dataset, Split
@@ -42,11 +41,9 @@ AS_RECORDED = "as recorded"  # the regime without any change
 Label = Annotated[str, Field(min_length=1, max_length=60), AfterValidator(printable)]
 
 
-def with_names(entries: Any, key: str) -> Any:
-    """The entries of a list, those that are a name alone as a mapping from ``key``; the model refuses unknown ones."""
-    if isinstance(entries, list | tuple):
-        return [{key: entry} if isinstance(entry, str) else entry for entry in entries]
-    return entries
+def named(key: str) -> Callable[[Any], Any]:
+    """A validator that takes a name alone as a mapping from ``key``."""
+    return lambda given: {key: given} if isinstance(given, str) else given
 
 
 def _known_backend(backend: str) -> str:
@@ -56,56 +53,7 @@ def _known_backend(backend: str) -> str:
     return backend
 
 
-def _is_squares(loss: object) -> bool:
-    """True for the default, which files do not say, so that those of earlier versions stay as they were."""
-    return loss == "squares"
-
-
-def _is_empty(entries: object) -> bool:
-    return not entries
-
-
-def _named_cost(cost: Any) -> Any:
-    return {"name": cost} if isinstance(cost, str) else cost
-
-
-NamedCost = Annotated[CostChoice, BeforeValidator(_named_cost, json_schema_input_type=str | CostChoice)]
-
-
-class RecordingSource(Model):
-    """Recordings of one robot: a data set (or a glob, or several), or a folder that an importer reads.
-
-    Paths are relative to the study's ``data``. A data set there that has the robot's name, as ``omnibench fetch`` makes
-    it, is taken where the folder to import is not.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_by_name=True, validate_by_alias=True)
-
-    path: Names = Field((), description="data set folders, or globs")
-    format: str | None = Field(None, description="an importer, see omnibench list; then path is its source")
-    options: dict[str, Any] = Field({}, description="the importer's")
-
-    def source(self, base: Path, name: str) -> DatasetSource:
-        """The source of the robot called ``name``, with its paths below a folder."""
-        places = [base / place for place in self.path]
-        if self.format is None:
-            return DatasetSource(path=tuple(places))
-        for place in (places[0], base / name):
-            if (place / "dataset.yaml").is_file():
-                return DatasetSource(path=place)
-            if place.exists():
-                break
-        return DatasetSource.model_validate(
-            {"import": {"format": self.format, "source": places[0], "options": self.options}}
-        )
-
-    @model_validator(mode="after")
-    def _place_is_given(self) -> RecordingSource:
-        if not self.path:
-            raise ValueError("path is missing: the folder of the data set or of the recordings, below the study's data")
-        if self.format is not None and len(self.path) > 1:
-            raise ValueError("an importer reads one folder; give one path")
-        return self
+NamedCost = Annotated[CostChoice, BeforeValidator(named("name"), json_schema_input_type=str | CostChoice)]
 
 
 class TrainingChoice(Model):
@@ -134,20 +82,46 @@ class TrainingChoice(Model):
         return self
 
 
-Rules = Annotated[
-    tuple[TrainingChoice, ...],
-    BeforeValidator(partial(with_names, key="by"), json_schema_input_type=tuple[str | TrainingChoice, ...]),
-]
+Rules = tuple[Annotated[TrainingChoice, BeforeValidator(named("by"), json_schema_input_type=str | TrainingChoice)], ...]
 
 
-class RobotChoice(RecordingSource):
+class RobotChoice(Model):
     """A robot: its recordings, the kinds of path in them, and how these are divided.
 
-    kinds: patterns of run ids by the name of the kind; runs of none are left out. Default: all runs are of one kind.
+    The recordings are a data set (or a glob, or several), or a folder that an importer reads. Paths are relative to the
+    study's ``data``. A data set there that has the robot's name, as ``omnibench fetch`` makes it, is taken where the
+    folder to import is not. kinds: patterns of run ids by the name of the kind; runs of none are left out. Default: all
+    runs are of one kind.
     """
+
+    path: Names = Field((), description="data set folders, or globs")
+    format: str | None = Field(None, description="an importer, see omnibench list; then path is its source")
+    options: dict[str, Any] = Field({}, description="the importer's")
 
     kinds: dict[Label, Names] = {}
     trainings: Rules = Field((), description="default: the study's")
+
+    def source(self, base: Path, name: str) -> DatasetSource:
+        """The source of the robot called ``name``, with its paths below a folder."""
+        places = [base / place for place in self.path]
+        if self.format is None:
+            return DatasetSource(path=tuple(places))
+        for place in (places[0], base / name):
+            if (place / "dataset.yaml").is_file():
+                return DatasetSource(path=place)
+            if place.exists():
+                break
+        return DatasetSource.model_validate(
+            {"import": {"format": self.format, "source": places[0], "options": self.options}}
+        )
+
+    @model_validator(mode="after")
+    def _place_is_given(self) -> RobotChoice:
+        if not self.path:
+            raise ValueError("path is missing: the folder of the data set or of the recordings, below the study's data")
+        if self.format is not None and len(self.path) > 1:
+            raise ValueError("an importer reads one folder; give one path")
+        return self
 
 
 class RegimeChoice(Model):
@@ -202,9 +176,8 @@ class CalibratorEntry(Model):
         return self.label or self.name
 
 
-Entries = Annotated[
-    tuple[CalibratorEntry, ...],
-    BeforeValidator(partial(with_names, key="name"), json_schema_input_type=tuple[str | CalibratorEntry, ...]),
+Entries = tuple[
+    Annotated[CalibratorEntry, BeforeValidator(named("name"), json_schema_input_type=str | CalibratorEntry)], ...
 ]
 
 
@@ -264,7 +237,7 @@ class CompareConfig(Model):
         "squares",
         description="of the cost's pose errors when they are fitted: as each calibrator takes them (squares), or one "
         "that bounds the influence of poses that are far off, its scale estimated",
-        exclude_if=_is_squares,
+        exclude_if=lambda loss: loss == "squares",
     )
     integration: Integration = "arc"
     box: Box = "row"
@@ -281,8 +254,8 @@ class CompareConfig(Model):
     )
     budget: Budget = Budget()
     seeds: tuple[int, ...] = Field((1,), min_length=1, description="one run of every search for each")
-    calibrators: Entries = Field((), description="what is compared", exclude_if=_is_empty)
-    methods: Entries = Field((), description="another word for calibrators", exclude_if=_is_empty)
+    calibrators: Entries = Field((), description="what is compared", exclude_if=lambda entries: not entries)
+    methods: Entries = Field((), description="another word for calibrators", exclude_if=lambda entries: not entries)
     reference: Label | None = Field(None, description="the entry that is compared with the best published one")
     plugins: tuple[RelativePath, ...] = Field((), description="folders of plug-ins; relative to the config file")
     workers: int | None = Field(None, gt=0, strict=True, description="processes; default: the processors")
@@ -399,12 +372,9 @@ def effective_config(config: CompareConfig) -> CompareConfig:
     if config.cost is not None or config.datasets:
         changes["cost"] = _effective_cost(config.cost or CostChoice(), place)
     for key in ("calibrators", "methods"):
-        entries = []
-        for index, entry in enumerate(getattr(config, key)):
-            options = _effective_options(entry, f"{place}: {key}.{index}")
-            cost = entry.cost and _effective_cost(entry.cost, f"{place}: {key}.{index}")
-            entries.append(entry.model_copy(update={"options": options.model_dump(mode="json"), "cost": cost}))
-        changes[key] = tuple(entries)
+        changes[key] = tuple(
+            _effective_entry(entry, f"{place}: {key}.{index}") for index, entry in enumerate(getattr(config, key))
+        )
     return config.model_copy(update=changes)
 
 
@@ -414,8 +384,8 @@ def _effective_cost(choice: CostChoice, place: str) -> CostChoice:
     return choice.model_copy(update={"options": options.model_dump(mode="json")})
 
 
-def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
-    """An entry's options with every default. ConfigError begins with ``place``: an unknown name or option."""
+def _effective_entry(entry: CalibratorEntry, place: str) -> CalibratorEntry:
+    """An entry with every default of its options. ConfigError begins with ``place``: an unknown name or option."""
     calibrator = calibrators.entry(entry.name, place)
     options = validate(calibrator.options, entry.options, f"{place}: calibrator {entry.name!r}")
     try:
@@ -424,7 +394,8 @@ def _effective_options(entry: CalibratorEntry, place: str) -> BaseModel:
         pass  # reported as the outcome of its run
     except OmnibenchError as error:
         raise ConfigError(f"{place}: {error}") from None
-    return options
+    cost = entry.cost and _effective_cost(entry.cost, place)
+    return entry.model_copy(update={"options": options.model_dump(mode="json"), "cost": cost})
 
 
 def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None) -> CompareConfig:
@@ -461,10 +432,8 @@ def read_compare_config(path: Path | str, data: Mapping[str, Path] | None = None
     return config.model_copy(update={"datasets": sources})
 
 
-_QUICK_EVALUATIONS, _QUICK_SECONDS = (
-    10_000,
-    30.0,
-)  # of each run; s; chosen: on two cores a first look takes a minute or two
+# Evaluations and s of each run: on two cores a first look takes a minute or two (chosen)
+_QUICK_EVALUATIONS, _QUICK_SECONDS = 10_000, 30.0
 _LONGEST_NAME = 60  # letters, of a config's name
 
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -80,48 +81,45 @@ def write_results(result: ComparisonResult) -> None:
     # The calibration files of an earlier comparison in the folder: the config may have other entries now
     try:
         rows = json.loads((result.output / "summary.json").read_text(encoding="utf-8"))["statistics"]
-        before = [row for row in rows if row["answers"] and row["calibrator"] != THEORETICAL_NAME]
-        earlier = _calibration_files(result.output, [(row["dataset"], row["label"]) for row in before])
+        written = [row for row in rows if row["answers"] and row["calibrator"] != THEORETICAL_NAME]
+        before = [(row["dataset"], row["label"]) for row in written]
     except (OSError, ValueError, KeyError, TypeError):
-        earlier = []
+        before = []
+    earlier = _calibration_files(result.output, before)
     disk.write_text(result.output / "summary.json", to_json(summary(result)) + "\n")
     for name, make in result_tables(result).items():
         disk.write_table(result.output / f"{name}.parquet", make())
-    for file in earlier:
+    for file in earlier.values():
         disk.remove(file)
     fitted = _fitted(result)
-    files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
-    for entry, file in zip(fitted, files, strict=True):
-        assert entry.typical is not None  # an entry with an answer has a typical run
-        write_calibration(calibration_of(entry.typical, result), file)
+    for key, file in _calibration_files(result.output, fitted).items():
+        write_calibration(calibration_of(fitted[key], result), file)
 
 
 def calibration_file(result: ComparisonResult, dataset: str, label: str) -> Path | None:
     """The file with the calibration of an entry's typical run; None for one that has none."""
-    fitted = _fitted(result)
-    files = _calibration_files(result.output, [(entry.dataset, entry.label) for entry in fitted])
-    keys = ((entry.dataset, entry.label) for entry in fitted)
-    return dict(zip(keys, files, strict=True)).get((dataset, label))
+    return _calibration_files(result.output, _fitted(result)).get((dataset, label))
 
 
-def _fitted(result: ComparisonResult) -> list[EntryStatistics]:
-    """The entries that have a calibration file."""
-    return [entry for entry in result.statistics if entry.answers and entry.calibrator != THEORETICAL_NAME]
+def _fitted(result: ComparisonResult) -> dict[tuple[str, str], ScoredFit]:
+    """The typical runs that have a calibration file, by data set and label."""
+    return {
+        (entry.dataset, entry.label): entry.typical
+        for entry in result.statistics
+        if entry.typical is not None and entry.calibrator != THEORETICAL_NAME
+    }
 
 
-def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> list[Path]:
-    """The calibration files of entries, which are given by data set and label."""
+def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Path]:
+    """The calibration files of entries, which are given by data set and label; names differ by more than case."""
     written: set[str] = set()
-    files = []
+    files = {}
     for dataset, label in entries:
         plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{dataset}-{label}").strip("_")
-        # Names of files differ in more than letter case
-        name, count = plain, 1
-        while name.lower() in written:
-            count += 1
-            name = f"{plain}-{count}"
+        names = chain([plain], (f"{plain}-{number}" for number in count(2)))
+        name = next(each for each in names if each.lower() not in written)
         written.add(name.lower())
-        files.append(folder / "calibrations" / f"{name}.yaml")
+        files[dataset, label] = folder / "calibrations" / f"{name}.yaml"
     return files
 
 

@@ -189,9 +189,9 @@ class Fold:
 
     name: str
     training: tuple[Trajectory, ...]
-    judged: Mapping[str, tuple[int, ...]]
+    judged: Mapping[str, Sequence[int]]
     session: str | None = None
-    fitted: Mapping[str, tuple[int, ...]] | None = None
+    fitted: Mapping[str, Sequence[int]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,164 +212,110 @@ class Training:
         return tuple(dict.fromkeys(kind for fold in self.folds for kind in fold.fitted or ()))
 
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """A data set's runs with their kinds; None: a run that is left out."""
-
-    dataset: Dataset
-    kinds: tuple[str | None, ...]
-
-    def of(self, kind: str) -> tuple[int, ...]:
-        return tuple(index for index, each in enumerate(self.kinds) if each == kind)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(kind for kind in self.kinds if kind is not None))
-
-    def runs(self, indices: Sequence[int]) -> tuple[Trajectory, ...]:
-        return tuple(self.dataset.trajectories[index] for index in indices)
-
-    def session(self, index: int) -> str | None:
-        return self.dataset.trajectories[index].session
-
-    def others(self, training: Sequence[int]) -> dict[str, tuple[int, ...]]:
-        """All runs outside a training set that are not copies of runs in it, by kind."""
-        within = set(training)
-        copies = {self.dataset.trajectories[index].fingerprint for index in training}
-        return {
-            kind: tuple(
-                index
-                for index in self.of(kind)
-                if index not in within and self.dataset.trajectories[index].fingerprint not in copies
-            )
-            for kind in self.names
-        }
-
-
 def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice], place: str) -> tuple[Training, ...]:
     """The trainings of a robot's runs; those that nothing judges are left out.
 
     place: what messages begin with. ConfigError: a run is of two kinds, a rule names an unknown kind, or two rules give
     the same training. DataError: no run is of a kind, or names its session, or is left to judge by.
     """
-    runs = _Runs(dataset, _kinds_of(dataset.trajectories, robot.kinds, place))
+    runs = dataset.trajectories
+    of_kind = _indices_by_kind(runs, robot.kinds, place)
     trainings: dict[str, Training] = {}
     for rule in rules:
         for kind in rule.kinds:
-            if kind not in runs.names:
-                hint = nearest(kind, runs.names)
-                raise ConfigError(f"{place}: no kind {kind!r} to train on; {hint}known: {', '.join(runs.names)}")
-        if "session" in (rule.by, rule.leave_out) and not all(run.session for run in dataset.trajectories):
+            if kind not in of_kind:
+                hint = nearest(kind, of_kind)
+                raise ConfigError(f"{place}: no kind {kind!r} to train on; {hint}known: {', '.join(of_kind)}")
+        if "session" in (rule.by, rule.leave_out) and not all(run.session for run in runs):
             raise DataError(
                 f"{place}: some runs name no session, by which they are to be divided; name them, or divide by kind"
             )
-        for training in _trainings(runs, rule):
-            if training.name in trainings:
-                raise ConfigError(f"{place}: two trainings are {training.name!r}; leave one out")
-            if training.folds and training.kinds:
-                trainings[training.name] = training
+        for name, folds in _divisions(runs, of_kind, rule):
+            if name in trainings:
+                raise ConfigError(f"{place}: two trainings are {name!r}; leave one out")
+            training = Training(name, tuple(folds))
+            if training.kinds:
+                trainings[name] = training
     if not trainings:
         raise DataError(f"{place}: no run is left to judge by; give it another training")
     return tuple(trainings.values())
 
 
-def _kinds_of(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> tuple[str | None, ...]:
+_ByKind = Mapping[str, Sequence[int]]  # indices of runs by kind, in the order of the kinds' first runs
+
+
+def _indices_by_kind(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> _ByKind:
     if not kinds:
-        return (ONE_KIND,) * len(runs)
-    matched: list[list[str]] = [
-        [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, pattern) for pattern in patterns)]
-        for run in runs
-    ]
+        return {ONE_KIND: range(len(runs))}
+    of_kind: dict[str, list[int]] = {}
+    for index, run in enumerate(runs):
+        mine = [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, each) for each in patterns)]
+        if len(mine) > 1:
+            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(mine)}; make the patterns differ")
+        for kind in mine:
+            of_kind.setdefault(kind, []).append(index)
     for kind, patterns in kinds.items():
-        if not any(kind in of_run for of_run in matched):
+        if kind not in of_kind:
             found = ", ".join(run.id for run in runs[:4])
             raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
-    for run, of_run in zip(runs, matched, strict=True):
-        if len(of_run) > 1:
-            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(of_run)}; make the patterns differ")
-    return tuple(of_run[0] if of_run else None for of_run in matched)
+    return of_kind
 
 
-def _trainings(runs: _Runs, rule: TrainingChoice) -> Iterator[Training]:
+def _divisions(
+    runs: Sequence[Trajectory], of_kind: _ByKind, rule: TrainingChoice
+) -> Iterator[tuple[str, Sequence[Fold]]]:
+    """The trainings of a rule, by name, with their folds."""
+    everything = sorted(index for indices in of_kind.values() for index in indices)
+
+    def fold(
+        training: Sequence[int], name: str = "", *, among: Sequence[int] = everything, unused: Sequence[int] = (),
+        session: str | None = None, fitted: _ByKind | None = None,
+    ) -> Fold:  # fmt: skip
+        """A fold that all runs of ``among`` judge which are neither in training, nor unused, nor copies of such."""
+        used = {*training, *unused}
+        copies = {runs[index].fingerprint for index in used}
+        judging = {index for index in set(among) - used if runs[index].fingerprint not in copies}
+        judged = {kind: tuple(index for index in indices if index in judging) for kind, indices in of_kind.items()}
+        return Fold(name, tuple(runs[index] for index in training), judged, session, fitted)
+
+    def grouped(what: str) -> dict[str, list[int]]:
+        """The members of a kind by session or command; runs without one are a group each."""
+        groups: dict[str, list[int]] = {}
+        for index in members:
+            groups.setdefault(getattr(runs[index], what) or runs[index].id, []).append(index)
+        return groups
+
     if rule.by == "split":
-        train = [
-            index for index, run in enumerate(runs.dataset.trajectories) if run.split == "train" and runs.kinds[index]
-        ]
-        judged = runs.others(train)
-        kinds = dict.fromkeys(runs.kinds[index] for index in train)
-        fold = Fold(
-            "",
-            runs.runs(train),
-            judged,
-            fitted={kind: tuple(i for i in train if runs.kinds[i] == kind) for kind in kinds if kind is not None},
-        )
-        yield Training(OWN_SPLIT, (fold,) if train else ())
-    elif rule.leave_out == "kind":
-        for kind in runs.names:
-            training = [index for index, each in enumerate(runs.kinds) if each not in (kind, None)]
-            if training:
-                fold = Fold("", runs.runs(training), {kind: runs.others(training)[kind]})
-                yield Training(f"all but {kind}", (fold,))
-    else:
-        for kind in rule.kinds or runs.names:
-            if rule.by == "session":
-                yield _each_session(runs, kind)
-            elif rule.by == "kind":
-                yield from _whole_kind(runs, kind, rule.runs_per_command)
-            elif rule.leave_out is not None:
-                yield _left_out(runs, kind, rule.leave_out)
-
-
-def _whole_kind(runs: _Runs, kind: str, curve: Sequence[int]) -> Iterator[Training]:
-    """All runs of a kind train; on a learning curve the first of each command, judged by what never trains."""
-    members = runs.of(kind)
-    if not curve:
-        yield Training(kind, (Fold("", runs.runs(members), runs.others(members), fitted={kind: members}),))
+        fitted = {kind: [i for i in indices if runs[i].split == "train"] for kind, indices in of_kind.items()}
+        training = [index for index in everything if runs[index].split == "train"]
+        folds = [fold(training, fitted={kind: mine for kind, mine in fitted.items() if mine})]
+        yield OWN_SPLIT, folds if training else ()
         return
-    used = _first_of_commands(runs, members, max(curve))
-    most = max(repetitions([run.command or run.id for run in runs.runs(members)]), default=0)
-    for count in sorted({min(count, most) for count in curve}):
-        train = _first_of_commands(runs, members, count)
-        fold = Fold("", runs.runs(train), runs.others(used), fitted={kind: tuple(train)})
-        yield Training(f"{kind}, {plural(count, 'run')} a command", (fold,))
-
-
-def _first_of_commands(runs: _Runs, members: Sequence[int], count: int) -> list[int]:
-    chosen = runs.runs(members)
-    numbers = repetitions([run.command or run.id for run in chosen])
-    return [index for index, number in zip(members, numbers, strict=True) if number <= count]
-
-
-def _each_session(runs: _Runs, kind: str) -> Training:
-    folds = []
-    for session, members in _grouped(runs, runs.of(kind), "session").items():
-        judged = {
-            name: tuple(index for index in indices if name != kind or runs.session(index) != session)
-            for name, indices in runs.others(members).items()
-        }
-        folds.append(Fold(session, runs.runs(members), judged, session))
-    return Training(f"{kind}, one session", tuple(folds))
-
-
-def _left_out(runs: _Runs, kind: str, what: str) -> Training:
-    members = runs.of(kind)
-    folds = []
-    groups = _grouped(runs, members, what)
-    for name, judged in groups.items():
-        training = [index for index in members if index not in set(judged)]
-        others = {kind: tuple(index for index in runs.others(training)[kind] if index in set(judged))}
-        if training and others[kind]:
-            folds.append(Fold(f"without {name}", runs.runs(training), others))
-    return Training(f"{kind}, a {what} left out", tuple(folds) if len(groups) > 1 else ())
-
-
-def _grouped(runs: _Runs, members: Sequence[int], what: str) -> dict[str, list[int]]:
-    """Indices by session or command; runs without one are a group each."""
-    groups: dict[str, list[int]] = {}
-    for index in members:
-        run = runs.dataset.trajectories[index]
-        groups.setdefault((run.session if what == "session" else run.command) or run.id, []).append(index)
-    return groups
+    for kind in rule.kinds or of_kind:
+        members = of_kind[kind]
+        if rule.leave_out == "kind":
+            training = [index for index in everything if index not in members]
+            yield f"all but {kind}", [fold(training)] if training else ()
+        elif rule.leave_out is not None:
+            groups = grouped(rule.leave_out)
+            rest = {name: [index for index in members if index not in group] for name, group in groups.items()}
+            folds = [fold(rest[name], f"without {name}", among=group) for name, group in groups.items()]
+            folds = [each for each in folds if each.judged[kind]]
+            yield f"{kind}, a {rule.leave_out} left out", folds if len(groups) > 1 else ()
+        elif rule.by == "session":
+            sessions = grouped("session")
+            yield f"{kind}, one session", [fold(group, name, session=name) for name, group in sessions.items()]
+        elif not rule.runs_per_command:
+            yield kind, [fold(members, fitted={kind: members})]
+        else:  # a learning curve: the first runs of each command train, and what never trains judges
+            numbers = repetitions([runs[index].command or runs[index].id for index in members])
+            first = {
+                count: [index for index, number in zip(members, numbers, strict=True) if number <= count]
+                for count in sorted({min(count, max(numbers, default=0)) for count in rule.runs_per_command})
+            }
+            for count, training in first.items():
+                curve = fold(training, unused=first[max(first)], fitted={kind: training})
+                yield f"{kind}, {plural(count, 'run')} a command", [curve]
 
 
 @dataclass(frozen=True, eq=False)

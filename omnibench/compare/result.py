@@ -64,9 +64,9 @@ class RunRecord(Model):
     parameters: tuple[PhysicalParameter, ...] | None
     at_bounds: tuple[str, ...]
     held: tuple[str, ...]
-    gap: float | None
-    gap_box: str | None
-    proven_gap: float | None
+    gap: float | None = None
+    gap_box: str | None = None
+    proven_gap: float | None = None
 
     @field_serializer("parameters")
     def _with_deviations(self, parameters: tuple[PhysicalParameter, ...] | None) -> list[dict[str, Any]] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,6 @@ from omnibench.compare.report.document import comparison_document
 from omnibench.compare.result import ComparisonResult, ScoredFit
 from omnibench.compare.score import certify, score_fits, typical_answers
 from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts, is_mean, make_cells
-from omnibench.data.dataset import Dataset
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, DataError, Interrupted, UnknownNameError, require_type
 from omnibench.files import results_locked
@@ -33,7 +32,7 @@ from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Backend, BackendError, Failure, Job, JobWatch, ResultStore, run_jobs
 from omnibench.processes import interrupts_not_in_callbacks, one_thread_processes
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import PluginFailure, calibrators
+from omnibench.registry import calibrators
 from omnibench.report.render import write_document
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import RobotConfig
@@ -156,12 +155,9 @@ class _Runs(JobWatch[RunResult]):
     def _report_all(self) -> None:
         self._report(Progress("comparing", len(self.results), len(self._plan), "run"))
 
-    def _report_run(
-        self, number: int, evaluations: int = 0, best: float | None = None, result: str | None = None
-    ) -> None:
+    def _report_run(self, number: int, done: int = 0, best: float | None = None, result: str | None = None) -> None:
         run = self._plan[number]
-        budget = run.settings.budget.evaluations
-        self._report(Progress(run.title, evaluations, budget, "evaluation", best, result=result))
+        self._report(Progress(run.title, done, run.settings.budget.evaluations, "evaluation", best, result=result))
 
     def _result(self, number: int, failure: Failure) -> RunResult:
         """The result of a run that left none. DataError: the disk refused it."""
@@ -170,11 +166,10 @@ class _Runs(JobWatch[RunResult]):
             return result
         if isinstance(failure.error, DataError):
             raise failure.error
-        now = time.monotonic()
+        run, now = self._plan[number], time.monotonic()
         spent = self._evaluations.get(number, 0), now - self._began.get(number, now)
         if not failure.over_time:
             return _without_answer(Outcome.FAILED, failure.reason, *spent)
-        run = self._plan[number]
         reason = f"ended by force: {run.settings.budget.seconds:g} s spent without an answer"
         result = _without_answer(Outcome.TIME, reason, *spent)
         self._store.put(run.key, result)  # it would spend them again
@@ -201,10 +196,11 @@ def run_comparison(
     require_type(config, CompareConfig, "read_compare_config")
     check_output(output, config, force=force)
     failures = load_calibrators(config.plugins, [entry.name for entry in config.entries])
+    broken_plugins = [f"plug-in {failure.origin} cannot be imported: {failure.error}" for failure in failures]
     with ExitStack() as lock:
         if output is not None:
             lock.enter_context(results_locked(output))
-        with _naming_failed_plugins(failures):
+        try:
             config = effective_config(config)
             with ExitStack() as opened:
                 workers = config.workers or os.cpu_count() or 1
@@ -221,8 +217,10 @@ def run_comparison(
                 store = ResultStore(cache or folder / "runs", RunResult)
                 with resumable(fits, store, folder), opened.pop_all():  # Ctrl-C while they close is resumable, too
                     results = execute(fits, store, progress, backend)
+        except UnknownNameError as error:  # the name may be that of a plug-in that cannot be imported
+            raise ConfigError("; ".join([str(error), *broken_plugins])) from None
         with resumable(fits, store, folder):
-            result = assess(config, robots, fits, results, folder, broken, failures, progress)
+            result = assess(config, robots, fits, results, folder, broken, broken_plugins, progress)
             write_results(result)
             write_document(comparison_document(result), folder / "report.html")
         return result
@@ -235,13 +233,13 @@ def assess(
     results: Sequence[RunResult],
     output: Path,
     broken: Mapping[str, str] | None = None,
-    failures: Sequence[PluginFailure] = (),
+    warnings: Sequence[str] = (),
     progress: Reporter = no_progress,
 ) -> ComparisonResult:
     """The comparison of the results of all fits: scores, proofs, statistics of entries and of cells.
 
-    broken: why recordings could not be read, by robot. failures: plug-ins that could not be imported. PluginError: a
-    cost raises.
+    broken: why recordings could not be read, by robot. warnings: those that there are already. PluginError: a cost
+    raises.
     """
     told = progress if config.robots else no_progress  # a data set is judged at once
     scored, designs = score_fits(config, fits, results, told)
@@ -249,6 +247,11 @@ def assess(
     of_datasets = [run for run in runs if run.row is not None]
     statistics = entry_statistics(of_datasets, config.bootstrap)
     datasets = {robot.name: robot.dataset for robot in robots if config.datasets}
+    # Sessions are compared by the design values: any would do
+    sessions = {
+        name: compare_sessions(OdometryModel.of_design(dataset.robot, config.integration), dataset.trajectories)
+        for name, dataset in datasets.items()
+    }
     return ComparisonResult(
         config=config,
         output=output,
@@ -261,40 +264,18 @@ def assess(
         certificates=certificates,
         typical=typical_answers(of_datasets, statistics),
         held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
-        sessions={name: _sessions_that_differ(dataset, config) for name, dataset in datasets.items()},
+        sessions={name: (*compared.sentences, *compared.doubts) for name, compared in sessions.items()},
         environment=environment(),
-        warnings=tuple(_warnings(config, failures, robots, runs)),
+        warnings=(*warnings, *_warnings(config, robots, runs)),
     )
 
 
-def _sessions_that_differ(dataset: Dataset, config: CompareConfig) -> tuple[str, ...]:
-    """Sentences on sessions that differ or could not be compared by the design values (any would do)."""
-    design = OdometryModel.of_design(dataset.robot, config.integration)
-    comparison = compare_sessions(design, dataset.trajectories)
-    return (*comparison.sentences, *comparison.doubts)
-
-
-@contextmanager
-def _naming_failed_plugins(failures: Sequence[PluginFailure]) -> Iterator[None]:
-    """Add the plug-ins that failed to import to an error of an unknown name, which may be one of theirs."""
-    try:
-        yield
-    except UnknownNameError as error:
-        raise ConfigError("; ".join([str(error), *map(_described, failures)])) from None
-
-
-def _warnings(
-    config: CompareConfig,
-    failures: Iterable[PluginFailure],
-    robots: Sequence[ComparedRobot],
-    runs: Sequence[ScoredFit],
-) -> Iterator[str]:
-    yield from map(_described, failures)
-    if config.robots:
-        yield from (f"{robot.name}: {warning}" for robot in robots for warning in robot.dataset.warnings)
-        return
+def _warnings(config: CompareConfig, robots: Sequence[ComparedRobot], runs: Sequence[ScoredFit]) -> Iterator[str]:
     for robot in robots:
-        yield from (f"data set {robot.name}: {warning}" for warning in robot.dataset.warnings)
+        place = robot.name if config.robots else f"data set {robot.name}"
+        yield from (f"{place}: {warning}" for warning in robot.dataset.warnings)
+    if config.robots:
+        return
     fits = [run.fit for run in runs]
     searched = [fit for fit in fits if fit.box_name != UNBOUNDED]
     for robot, parameterisation in dict.fromkeys((fit.robot, fit.settings.parameterisation) for fit in searched):
@@ -303,12 +284,7 @@ def _warnings(
         undetermined = warnings_of_calibration(robot.dataset.robot, span, parameterisation, treatment)
         yield from (f"data set {robot.name}, fit of the {parameterisation}: {warning}" for warning in undetermined)
     if config.loss != "squares":
-        first = {fit.robot.name: fit for fit in reversed(fits)}
-        for name, fit in first.items():
+        for name, fit in {fit.robot.name: fit for fit in reversed(fits)}.items():
             yield from (f"data set {name}: {sentence}" for sentence in fit.problem().moved_ends)
     if not all(is_mean(run) for run in runs):
         yield "the cost is no mean over trajectories: intervals and differences are of the mean of their own costs"
-
-
-def _described(failure: PluginFailure) -> str:
-    return f"plug-in {failure.origin} cannot be imported: {failure.error}"

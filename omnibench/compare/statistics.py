@@ -18,15 +18,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
 from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
 from omnibench.compare.config import AS_RECORDED
-from omnibench.compare.plan import ComparedRobot, Fold, Training
+from omnibench.compare.plan import Fold
 from omnibench.compare.ratios import Pairs
 from omnibench.compare.result import (
     MEASURES,
@@ -65,30 +65,24 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
     intervals = RatioIntervals(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
-        competing = [run for (name, _), run in typical.items() if name == dataset and run is not None]
-        best = _best(competing, intervals)
-        median_run = typical[dataset, label]
-        record = group[0].record
-        costs = [run.record.train_cost for run in group if run.record.train_cost is not None]
-        gaps = [run.record.gap for run in group if run.record.gap is not None]
-        proven = [run.record.proven_gap for run in group if run.record.proven_gap is not None]
+        best = _best([run for (name, _), run in typical.items() if name == dataset and run is not None], intervals)
+        median, records = typical[dataset, label], [run.record for run in group]
+        costs = [record.train_cost for record in records if record.train_cost is not None]
+        scores, design = ({}, {}) if median is None else (median.scores, median.design)
         difference, equal = None, None
-        if median_run is not None and best is not None:
-            difference, equal = _against_best(median_run, best, intervals)
-        scores, design = (median_run.scores, median_run.design) if median_run is not None else ({}, {})
-        records = [run.record for run in group]
-        ratios = [each.seconds / each.reference_seconds for each in records if each.reference_seconds]
+        if median is not None and best is not None:
+            difference, equal = _against_best(median, best, intervals)
         statistics.append(
             EntryStatistics(
-                dataset=record.dataset,
-                label=record.label,
-                calibrator=record.calibrator,
-                parameterisation=record.parameterisation,
-                box=record.box,
+                dataset=dataset,
+                label=label,
+                calibrator=records[0].calibrator,
+                parameterisation=records[0].parameterisation,
+                box=records[0].box,
                 runs=len(group),
                 answers=len(costs),
-                typical=median_run,
-                train_median=float(np.median(costs)) if costs else None,
+                typical=median,
+                train_median=_median(costs),
                 train_spread=float(np.subtract(*np.percentile(costs, [75, 25]))) if costs else None,
                 costs={split: intervals.mean(score.costs, score.units) for split, score in scores.items()},
                 improvements={
@@ -97,15 +91,23 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
                 },
                 difference=difference,
                 practically_equal=equal,
-                is_best=median_run is not None and median_run is best,
-                gap_median=float(np.median(gaps)) if gaps else None,
-                proven_gap_median=float(np.median(proven)) if proven else None,
-                evaluations_median=float(np.median([run.record.evaluations for run in group])),
-                seconds_median=float(np.median([run.record.seconds for run in group])),
-                reference_evaluations_median=float(np.median(ratios)) if ratios else None,
+                is_best=median is not None and median is best,
+                gap_median=_median(record.gap for record in records),
+                proven_gap_median=_median(record.proven_gap for record in records),
+                evaluations_median=_median(record.evaluations for record in records),
+                seconds_median=_median(record.seconds for record in records),
+                reference_evaluations_median=_median(
+                    record.seconds / record.reference_seconds for record in records if record.reference_seconds
+                ),
             )
         )
     return tuple(statistics)
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    """The median of those that are known; None without any."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def design_costs(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> dict[str, dict[Split, Interval]]:
@@ -190,82 +192,65 @@ def _standard_error(score: SplitScore) -> float:
 
 def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tuple[Cell, ...]:
     """All cells, in the order of the fits. design: by robot, errors (Z, 3) of the design values."""
-    groups: dict[tuple[str, str, str], list[ScoredFit]] = {}
+    groups: dict[tuple[str, str, str], dict[str, list[ScoredFit]]] = {}
     for each in judged:
-        groups.setdefault((each.fit.robot.name, each.fit.training.name, each.fit.regime), []).append(each)
+        place = each.fit.robot.name, each.fit.training.name, each.fit.regime
+        groups.setdefault(place, {}).setdefault(each.fit.label, []).append(each)
     cells = []
-    for (robot_name, training_name, regime), fits in groups.items():
-        robot, training = fits[0].fit.robot, fits[0].fit.training
-        for fitted, kinds in ((False, training.kinds), (True, training.fitted_kinds)):
-            for kind in kinds:
-                if fitted and regime != AS_RECORDED:
-                    continue
-                key = CellKey(robot_name, training_name, regime, kind, fitted)
-                cells.append(_cell(key, robot, training, fits, design[robot_name]))
+    for (robot, training_name, regime), of_methods in groups.items():
+        fit = next(iter(of_methods.values()))[0].fit
+        folds, runs = fit.training.folds, fit.robot.dataset.trajectories
+        designs = np.broadcast_to(design[robot], (len(folds), *design[robot].shape))
+        methods = {name: _method(name, fits) for name, fits in of_methods.items()}
+        errors = {name: _by_seeds(fits, folds, designs) for name, fits in of_methods.items()}
+        places = [(kind, False) for kind in fit.training.kinds]
+        places += [(kind, True) for kind in fit.training.fitted_kinds if regime == AS_RECORDED]
+        for kind, fitted in places:
+            listed = [
+                (number, index)
+                for number, fold in enumerate(folds)
+                for index in ((fold.fitted or {}) if fitted else fold.judged).get(kind, ())
+            ]
+            numbers, indices = np.array(listed, dtype=int).T
+            trained_in = tuple(folds[number].session for number in numbers)
+            pairs = Pairs(numbers, indices, trained_in, tuple(runs[index].session for index in indices))
+            in_cell = {}
+            for name, method in methods.items():
+                measured = [_measured(of_seed, pairs) for of_seed in errors[name]]
+                means = {measure: np.mean([of[measure] for of in measured], axis=0) for measure in MEASURES}
+                in_cell[name] = replace(method, errors=means) if method.answers else method
+            key = CellKey(robot, training_name, regime, kind, fitted)
+            cells.append(Cell(key, pairs, _measured(designs, pairs), in_cell))
     return tuple(cells)
 
 
-def _cell(key: CellKey, robot: ComparedRobot, training: Training, fits: Sequence[ScoredFit], design: Array) -> Cell:
-    pairs = _pairs(robot, training.folds, key)
-    folds = {id(fold): number for number, fold in enumerate(training.folds)}
-    by_method: dict[str, list[ScoredFit]] = {}
+def _by_seeds(fits: Sequence[ScoredFit], folds: Sequence[Fold], designs: Array) -> list[Array]:
+    """A method's errors (folds, Z, 3) by seed, the design's where it has no answer."""
+    of_seeds = {each.fit.settings.seed: np.array(designs) for each in fits}
+    numbers = {id(fold): number for number, fold in enumerate(folds)}
     for each in fits:
-        by_method.setdefault(each.fit.label, []).append(each)
-    designs = np.broadcast_to(design, (len(training.folds), *design.shape))
-    return Cell(
-        key,
-        pairs,
-        _measured(designs, pairs),
-        {name: _method(name, of_one, folds, pairs, designs) for name, of_one in by_method.items()},
-    )
+        if each.errors is not None:
+            of_seeds[each.fit.settings.seed][numbers[id(each.fit.fold)]] = each.errors
+    return list(of_seeds.values())
 
 
-def _pairs(robot: ComparedRobot, folds: Sequence[Fold], key: CellKey) -> Pairs:
-    runs = robot.dataset.trajectories
-    listed = [
-        (number, index)
-        for number, fold in enumerate(folds)
-        for index in ((fold.fitted or {}) if key.fitted else fold.judged).get(key.judged, ())
-    ]
-    return Pairs(
-        np.array([number for number, _ in listed], dtype=int),
-        np.array([index for _, index in listed], dtype=int),
-        tuple(folds[number].session for number, _ in listed),
-        tuple(runs[index].session for _, index in listed),
-    )
-
-
-def _method(
-    name: str, fits: Sequence[ScoredFit], folds: Mapping[int, int], pairs: Pairs, designs: Array
-) -> MethodInCell:
+def _method(name: str, fits: Sequence[ScoredFit]) -> MethodInCell:
+    """A method in all cells of its fits, without their errors."""
     answered = [each for each in fits if each.errors is not None]
-    silent = next((each.result.reason for each in fits if each.errors is None), "")
-    errors = None
-    if answered:
-        seeds = list(dict.fromkeys(each.fit.settings.seed for each in fits))
-        of_seeds = []
-        for seed in seeds:
-            of_folds = np.array(designs)
-            for each in answered:
-                if each.fit.settings.seed == seed and each.errors is not None:
-                    of_folds[folds[id(each.fit.fold)]] = each.errors
-            of_seeds.append(_measured(of_folds, pairs))
-        errors = {measure: np.mean([of_one[measure] for of_one in of_seeds], axis=0) for measure in MEASURES}
     asked = [each.fit.settings for each in fits if not each.fit.refusal]
-    seconds = [each.result.seconds for each in answered]
     return MethodInCell(
         method=name,
         family=fits[0].fit.entry.family,
         fits=len(fits),
         outcomes=Counter(str(each.result.outcome) for each in fits),
-        reason=silent,
-        errors=errors,
-        seconds=float(np.median(seconds)) if seconds else None,
+        reason=next((each.result.reason for each in fits if each.errors is None), ""),
+        errors=None,
+        seconds=_median(each.result.seconds for each in answered),
         numbers=answered[0].result.reason if answered else "",
         answers=len(answered),
         cost=", ".join(dict.fromkeys(settings.objective for settings in asked)),
         unidentified=", ".join(dict.fromkeys(settings.unidentified for settings in asked)),
-        matrix=answered[0].matrix if answered else None,
+        matrix=answered[0].result.matrix if answered else None,
     )
 
 

@@ -171,16 +171,6 @@ def _doubts(view: views.DatasetView) -> Iterator[str]:
             f"{best.label} has not found the minimum: its training cost is {above}. That it does better on other data "
             "may be chance, or the splits differ in more than noise."
         )
-    lower = [
-        "{}: {} ({})".format(entry.label, *views.difference_cells(entry.difference))
-        for entry, _ in view.calibrated
-        if entry.difference is not None and entry.practically_equal is False and entry.difference.value < 0
-    ]
-    if lower:
-        yield (
-            f"Below {best.label} in {views.SPLIT_NAMES[split]} cost, as the mean difference with its 95 % interval, "
-            f"though above it in training cost: {listing(lower, 20)}."
-        )
     # Commands on which it does worse than the design values
     before, after = best.typical.design[split].costs, best.typical.scores[split].costs
     rows: dict[str, list[int]] = {}

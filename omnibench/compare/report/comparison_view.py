@@ -72,8 +72,7 @@ class ComparisonView(Result):
             shown.append(tables.cost_table(view, view.scored, brief=not self.everything))
             if self.everything:
                 shown += [tables.cost_table(view, split) for split in view.splits[1:]]
-                shown += [tables.outcome_table(result, view.runs), *tables.certificate_table(view)]
-                shown.append(tables.outcome_table(result, view.runs, every=True))
+                shown += [tables.outcome_table(result, view.runs, every=every) for every in (False, True)]
         return shown
 
     def remarks(self) -> Sequence[Remark]:

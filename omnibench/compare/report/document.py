@@ -119,8 +119,7 @@ def _sections(view: sets.DatasetView) -> Iterator[page.Section]:
     yield from _folded("directions", "Errors by direction", about, *flower_figures(view))
     every = page.Details(f"Every run ({len(fits)})", (tables.outcome_table(result, fits, every=True),))
     about = "Every entry over its seeds; what no optimiser can beat; every run."
-    outcomes = (tables.outcome_table(result, fits), *tables.certificate_table(view))
-    yield from _folded("outcomes", "Outcomes", about, *outcomes, every)
+    yield from _folded("outcomes", "Outcomes", about, tables.outcome_table(result, fits), every)
     yield from _folded("searches", "Searches", "How fast each came how near the best known cost.", *search_blocks(view))
     about = "All elements, their differences from the design values, and the wheels that they stand for."
     if view.calibrated:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -132,6 +133,17 @@ def outcome_table(result: ComparisonResult, fits: Sequence[ScoredFit], *, every:
             cells += _costs_of([run.record for run in group])
         reasons = list(dict.fromkeys(run.result.reason for run in (group if of_sets else (answered or group)[:1])))
         rows.append(Row.of(*cells, listing(reasons, 2), role="plain" if answered else "failed"))
+    names = {run.fit.robot.name for run in fits}
+    proofs = [proof for proof in result.certificates if proof.dataset in names and not every]
+    if proofs:
+        rows.append(Row.of("What no optimiser can beat", role="group"))
+    for proof in proofs:
+        how = "proven" if proof.finished else "time or parts ran out"
+        bound, left = significant(proof.lower_bound, 6), f"≤ {percent(proof.gap, 2)}"
+        least = Cell(bound, f"{significant(proof.best_cost, 6)} was found")
+        parts = f"{count(proof.parts)} parts of the box"
+        ends = ("", Cell(left, "of the cost is left"), "", "no matrix of the box has a lower training cost")
+        rows.append(Row.of(f"box {proof.box}", Cell(how, parts), "", seconds(proof.seconds), least, *ends))
     note = "Medians over fits." if not every else ""
     if of_sets:
         note += f" Gap: above closed_form in the same box; {NOTHING} where that has no answer or leaves no error."
@@ -164,26 +176,6 @@ def _costs_of(records: Sequence[RunRecord]) -> Iterator[Cell | str]:
     yield Cell("0" if gap is not None and abs(gap) < 5e-13 else significant(gap, 2), left)  # below it: rounding
     bounds = dict.fromkeys(name for record in records for name in record.at_bounds if name not in record.held)
     yield ", ".join(bounds) or NOTHING
-
-
-def certificate_table(view: views.DatasetView) -> Iterator[Table]:
-    """Lower bounds on the training cost, one for each box for which one is proven."""
-    rows = [
-        Row.of(
-            each.box,
-            significant(each.best_cost, 6),
-            significant(each.lower_bound, 6),
-            Cell(percent(each.gap, 2), "" if each.finished else "time or parts ran out"),
-            Cell(count(each.parts), seconds(each.seconds)),
-        )
-        for each in view.result.certificates
-        if each.dataset == view.name
-    ]
-    titles = ("Lowest training cost found", "No matrix of the box is below", "Left to gain, at most", "Parts, time")
-    note = "Proven by branch and bound on row 3 of the matrix, with rounding counted in, whichever search is used."
-    if rows:
-        columns = (Column("Box", numeric=False), *map(Column, titles))
-        yield Table("What no optimiser can beat", columns, tuple(rows), note)
 
 
 def matrix_table(view: views.DatasetView, against: str | None = None, labels: Sequence[str] = ()) -> Table:
@@ -265,17 +257,25 @@ def bound_marks(record: RunRecord) -> dict[str, str]:
 
 def methods_table(result: ComparisonResult) -> Table:
     """Every method on every robot: geometric mean over cells of its error as a share of the design's, or why none."""
-    robots, rows = [robot.name for robot in result.robots], []
-    for method in (entry.shown for entry in result.config.entries):
-        cells: list[Cell | str] = []
-        for robot in robots:
-            mine = [c for c in result.judged_cells if c.key.robot == robot and method in c.methods]
-            ratios = [share for cell in mine if (share := cell.share(method)) is not None]
-            mean, silent = mean_ratio(ratios), mine[0].methods[method].status if mine else NOTHING
-            cells.append(silent if mean is None else Cell(fixed(mean, 2), plural(len(ratios), "cell")))
-        rows.append(Row.of(method, *cells))
+
+    def on_robot(robot: str, method: str) -> Cell:
+        mine = [cell for cell in result.judged_cells if cell.key.robot == robot and method in cell.methods]
+        ratios = [share for cell in mine if (share := cell.share(method)) is not None]
+        if (mean := mean_ratio(ratios)) is not None:
+            return Cell(fixed(mean, 2), plural(len(ratios), "cell"))
+        return Cell(mine[0].methods[method].status if mine else NOTHING)
+
     caption = "Mean error of runs that did not train, Eq. (6), as a share of the design's, geometric mean over cells"
-    return Table(caption, (Column("Method", numeric=False), *map(Column, robots)), tuple(rows))
+    return _by_method(result, caption, {robot.name: partial(on_robot, robot.name) for robot in result.robots})
+
+
+def _by_method(
+    result: ComparisonResult, caption: str, columns: Mapping[str, Callable[[str], Cell]], note: str = ""
+) -> Table:
+    """A row for each method."""
+    methods = [entry.shown for entry in result.config.entries]
+    rows = tuple(Row.of(method, *(make(method) for make in columns.values())) for method in methods)
+    return Table(caption, (Column("Method", numeric=False), *map(Column, columns)), rows, note)
 
 
 def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
@@ -335,26 +335,22 @@ def regime_table(result: ComparisonResult) -> Table:
     for cell in result.cells:
         if not cell.key.fitted:
             places.setdefault((cell.key.robot, cell.key.training, cell.key.judged), {})[cell.key.regime] = cell
-    rows = []
-    for method in (entry.shown for entry in result.config.entries):
-        cells = []
-        for regime in result.config.regimes:
-            pairs = [(of[AS_RECORDED], of[regime]) for of in places.values() if {AS_RECORDED, regime} <= of.keys()]
-            means = [(a, b, worse) for usual, worse in pairs if (a := usual.mean(method)) and (b := worse.mean(method))]
-            mean = mean_ratio([b / a for a, b, _ in means])
-            broken = sum(b > _BROKEN * a for a, b, _ in means)
-            beyond = sum(b > float(cell.design["cost"].mean()) * (1 + 1e-9) for _, b, cell in means)
-            note = f"{broken} of {len(means)} break; {beyond} worse"
-            cells.append(Cell(NOTHING) if mean is None else Cell(fixed(mean, 2), note))
-        if any(cell.text != NOTHING for cell in cells):
-            rows.append(Row.of(method, *cells))
-    return Table(
-        "Error as a multiple of the method's own as recorded",
-        (Column("Method", numeric=False), *map(Column, result.config.regimes)),
-        tuple(rows),
+
+    def in_regime(regime: str, method: str) -> Cell:
+        pairs = [(of[AS_RECORDED], of[regime]) for of in places.values() if {AS_RECORDED, regime} <= of.keys()]
+        means = [(a, b, worse) for usual, worse in pairs if (a := usual.mean(method)) and (b := worse.mean(method))]
+        mean = mean_ratio([b / a for a, b, _ in means])
+        broken = sum(b > _BROKEN * a for a, b, _ in means)
+        beyond = sum(b > float(cell.design["cost"].mean()) * (1 + 1e-9) for _, b, cell in means)
+        note = f"{broken} of {len(means)} break; {beyond} worse"
+        return Cell(NOTHING) if mean is None else Cell(fixed(mean, 2), note)
+
+    note = (
         f"Eq. (6), geometric mean over cells. Break: cells with more than {_BROKEN:g} times its own error as recorded; "
-        "worse: with more error than the design.",
+        "worse: with more error than the design."
     )
+    columns = {regime: partial(in_regime, regime) for regime in result.config.regimes}
+    return _by_method(result, "Error as a multiple of the method's own as recorded", columns, note)
 
 
 def data_table(robots: Sequence[ComparedRobot], broken: Mapping[str, str]) -> Table:

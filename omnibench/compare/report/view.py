@@ -11,8 +11,7 @@ import numpy as np
 from omnibench.compare import result as results
 from omnibench.compare.config import THEORETICAL_NAME, CompareConfig, PublishedResult
 from omnibench.compare.plan import UNBOUNDED
-from omnibench.data.dataset import SPLITS, Dataset, Split
-from omnibench.fit.evaluate import final_errors
+from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.intervals import Clusters, Interval, units_of
 from omnibench.fit.reference_rows import measured_parts
 from omnibench.report.blocks import Cell, LegendItem
@@ -83,9 +82,7 @@ class DatasetView:
     @cached_property
     def design_errors(self) -> Mapping[Split, Array]:
         """Final pose errors (Z, 3) of the design matrix on each split that has trajectories, m, m, rad."""
-        design = OdometryModel.of_design(self.dataset.robot, self.config.integration)
-        splits = [split for split in SPLITS if self.dataset.split(split)]
-        return {split: self._told(final_errors(design, self.dataset.split(split)), split) for split in splits}
+        return {split: self._told(score.errors, split) for split, score in self.runs[0].design.items()}
 
     def errors(self, entry: results.EntryStatistics | None, split: Split) -> Array | None:
         """Final pose errors (Z, 3) of an entry's typical answer, m, m, rad; NaN where the references do not tell them.
