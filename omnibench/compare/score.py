@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omnibench.compare.config import CertificateChoice, CompareConfig
 from omnibench.compare.plan import PlannedFit
@@ -69,17 +68,19 @@ class SplitScorer:
     ) -> None:
         self._cost, self._trajectories = cost, tuple(trajectories)
         self._units, self._odometry = units_of(trajectories, unit), cost.batch(trajectories, integration)
-        self._reference = cost.reference(trajectories)
+        self._reference, self._ends = cost.reference(trajectories), FinalErrors(trajectories, integration)
 
-    def score(self, model: Array | OdometryModel, ends: Array) -> SplitScore:
-        """Costs of a matrix (3, N) or a model with effects, beside its final errors (Z, 3).
+    def score(self, model: Array | OdometryModel) -> SplitScore:
+        """Costs and final errors of a matrix (3, N), or of a model with effects.
 
         PluginError when the cost raises or is not a finite number. DataError: the model lacks what an effect needs.
         """
         if isinstance(model, OdometryModel):
             errors, owner = self._cost.errors_of(model, self._trajectories)
+            ends = final_errors(model, self._trajectories)
         else:
             errors, owner = self._odometry.poses(model[None])[0] - self._reference, self._odometry.trajectory
+            (ends,) = self._ends.of_matrices([model])
         cost = float(self._checked(1, lambda: self._cost.combine(errors[None], owner))[0])
         costs = self._checked(len(self._trajectories), lambda: self._cost.of_each(errors, owner))
         return SplitScore(cost, costs, ends, self._units, self._cost.rounding)
@@ -111,25 +112,19 @@ def score_fits(
     designs: dict[str, Array] = {}
     for robot in {fit.robot.name: fit.robot for fit in fits}.values():
         progress(Progress("judging", len(scored), len(fits), "answer"))
-        dataset, runs = robot.dataset, robot.dataset.trajectories
-        scorers: dict[Split, tuple[NDArray[np.bool_], SplitScorer]] = {}
+        dataset, runs, choice = robot.dataset, robot.dataset.trajectories, config.cost or CostChoice()
+        scorers: dict[Split, SplitScorer] = {}
         for split in SPLITS if config.datasets else ():
-            rows = np.array([run.split == split for run in runs])
-            if rows.any():
-                choice = config.cost or CostChoice()
+            if of_split := dataset.split(split):
                 cost = costs.create(choice.name, choice.options)
-                scorer = SplitScorer(dataset.split(split), cost, config.integration, config.bootstrap.unit)
-                scorers[split] = rows, scorer
-
-        def scores_of(model: Array | OdometryModel, errors: Array, scorers: Any = scorers) -> dict[Split, SplitScore]:
-            return {split: scorer.score(model, errors[rows]) for split, (rows, scorer) in scorers.items()}
-
+                scorers[split] = SplitScorer(of_split, cost, config.integration, config.bootstrap.unit)
         mine = [(index, fit) for index, fit in enumerate(fits) if fit.robot is robot]
         plain = [i for i, _ in mine if results[i].matrix is not None and results[i].extension is None]
         matrices = [matrix for i in plain if (matrix := results[i].matrix) is not None]
         start, judge = dataset.robot.inverse_kinematic_matrix, FinalErrors(runs, config.integration)
-        designs[robot.name], *errors = judge.of_matrices([start, *matrices])
-        of_plain, design = dict(zip(plain, errors, strict=True)), scores_of(start, designs[robot.name])
+        (designs[robot.name],) = judge.of_matrices([start])
+        of_plain = dict(zip(plain, judge.of_matrices(matrices), strict=True))
+        design = {split: scorer.score(start) for split, scorer in scorers.items()}
         for index, fit in mine:
             result, of_fit, scores = results[index], of_plain.get(index), dict[Split, SplitScore]()
             try:
@@ -141,8 +136,7 @@ def score_fits(
                             fit.label,
                         )  # fmt: skip
                         of_fit = final_errors(model, runs)
-                    assert of_fit is not None  # those of plain matrices are known
-                    scores = scores_of(model, of_fit)
+                    scores = {split: scorer.score(model) for split, scorer in scorers.items()}
             except OmnibenchError as error:
                 if isinstance(error, PluginError) and config.datasets:  # its cost
                     raise

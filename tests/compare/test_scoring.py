@@ -17,7 +17,7 @@ from omnibench.compare.config import Bootstrap, CertificateChoice, CompareConfig
 from omnibench.compare.plan import PlannedFit, load_robots, plan_fits
 from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.result import ComparisonResult, EntryStatistics, RunRecord, ScoredFit, SplitScore
-from omnibench.compare.score import FinalErrors, SplitScorer, mean_errors_of, score_fits
+from omnibench.compare.score import SplitScorer, mean_errors_of, score_fits
 from omnibench.compare.statistics import NEGLIGIBLE_SHARE, entry_statistics
 from omnibench.data.dataset import Dataset, Split, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
@@ -25,7 +25,7 @@ from omnibench.errors import PluginError
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.calibrator import Outcome, RunResult, run_calibrator
 from omnibench.fit.cost import Cost, SumOfNorms
-from omnibench.fit.evaluate import evaluate, final_errors
+from omnibench.fit.evaluate import evaluate
 from omnibench.fit.intervals import Clusters
 from omnibench.registry import calibrators, costs, effects
 from omnibench.report.terminal import print_result
@@ -147,7 +147,7 @@ def test_a_cost_that_is_no_cost_is_one_line(combined: Callable[[int], Array], co
     dataset = load_dataset(prepare().data)
     scorer = SplitScorer(dataset.split("train"), Mine(combined), "arc")
     with refused(PluginError, complaint):
-        scorer.score(TRUE, np.zeros((1, 3)))
+        scorer.score(TRUE)
 
 
 ROOT_MEAN_SQUARE = """
@@ -211,11 +211,10 @@ def test_a_model_without_effects_has_the_score_of_its_matrix(name: str) -> None:
     dataset = load_dataset(prepare().data)
     runs, matrix = dataset.split("train"), published_matrix("palacin2023_eq8")
     scorer, model = SplitScorer(runs, costs.create(name), "arc"), OdometryModel(dataset.robot, matrix, "arc")
-    (ends,) = FinalErrors(runs, "arc").of_matrices([matrix])
-    of_matrix, of_model = scorer.score(matrix, ends), scorer.score(model, ends)
+    of_matrix, of_model = scorer.score(matrix), scorer.score(model)
     assert of_model.cost == pytest.approx(of_matrix.cost, rel=1e-9)
     np.testing.assert_allclose(of_model.costs, of_matrix.costs, rtol=1e-9)
-    np.testing.assert_allclose(final_errors(model, runs), ends, atol=1e-12)
+    np.testing.assert_allclose(of_model.errors, of_matrix.errors, atol=1e-12)
 
 
 def test_row_and_file_are_of_the_model_with_its_effects(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def interval_chart(
     figure = plot(*traces, x_title=x_title)
     names = [text(wrapped(label, 40)) for label, *_ in lines]
     _name_rows(figure, names, len(lines) - 0.4)
-    height = 70 + sum(11 + 14 * (1 + label.count("<br>")) for label in names)
+    height = 70 + (11 + 14 * max(1 + label.count("<br>") for label in names)) * len(lines)
     picture = page.Figure(title, figure, "; ".join(words for *_, words in lines), height)
     return page.FigureGrid((picture,), tuple(items), 1, caption, name)
 

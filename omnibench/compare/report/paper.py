@@ -56,37 +56,35 @@ def published_blocks(view: views.DatasetView) -> Iterator[Block]:
     elif published:
         yield _figure_table(view)
         yield _circumstances(view)
-        if lines := _claims(view):
-            yield Callout("What the paper claims, and what is seen here", lines)
         remarks = tuple(dict.fromkeys(remark for result in published for remark in result.remarks))
-        if remarks:
-            yield Callout("About the published figures", remarks)
+        yield Callout("What the paper claims, and what is seen here", tuple(_claims(view)))
+        yield Callout("About the published figures", remarks)
         yield from _fig_4(view)
 
 
-def _claims(view: views.DatasetView) -> tuple[str, ...]:
+def _claims(view: views.DatasetView) -> Iterator[str]:
     """Two claims of the paper: curves show systematic errors best, and a genetic algorithm avoids local minima."""
-    lines, split, turns = [], view.scored, [run.omega for run in view.dataset.split(view.scored)]
+    split, turns = view.scored, [run.omega for run in view.dataset.split(view.scored)]
     turning = np.array([bool(turn) for turn in turns])
-    if view.runs and None not in turns and 0 < turning.sum() < len(turning):
+    if None not in turns and 0 < turning.sum() < len(turning):
         costs = view.runs[0].design[split].costs
         curved, straight = float(costs[turning].mean()), float(costs[~turning].mean())
-        seen = "so here" if curved > straight else "not here"
-        lines.append(
-            f"Curves show systematic errors best (section 4.1): {seen}, Eq. (6) of the design values is "
-            f"{fixed(curved, 3)} on the {views.SPLIT_NAMES[split]} runs in curves and {fixed(straight, 3)} on straight "
-            "ones."
+        yield (
+            f"Curves show systematic errors best (section 4.1): {'so' if curved > straight else 'not'} here, Eq. (6) "
+            f"of the design values is {fixed(curved, 3)} on the {views.SPLIT_NAMES[split]} runs in curves and "
+            f"{fixed(straight, 3)} on straight ones."
         )
     genetic = next((run for _, entry, run in view.published_entries if entry.parameterisation == "matrix"), None)
+    if genetic is None:
+        return
+    # Training costs of the other searches from random starts in the same box
     costs_of: dict[str, list[float]] = {}
     for run in view.runs:
         record = run.record
-        rival = (
-            genetic is not None and record.label != genetic.record.label and run.search_space == genetic.search_space
-        )
+        rival = record.label != genetic.record.label and run.search_space == genetic.search_space
         if rival and calibrators.entry(record.calibrator).cls.stochastic and record.train_cost is not None:
             costs_of.setdefault(record.label, []).append(record.train_cost)
-    if genetic is not None and costs_of:
+    if costs_of:
         box, lowest = genetic.record.box, min(min(costs) for costs in costs_of.values())
         met = [
             f"{sum(cost <= (1 + _MET) * lowest for cost in costs)} of {plural(len(costs), 'run')} of {label}"
@@ -97,11 +95,10 @@ def _claims(view: views.DatasetView) -> tuple[str, ...]:
             for certificate in view.result.certificates
             if (certificate.dataset, certificate.box) == (view.name, box)
         ]
-        lines.append(
+        yield (
             f"Local minima (section 5): from random starts in the box {box}, {listing(met)} ended within "
             f"{percent(_MET, 2)} of one cost, {fixed(lowest, view.cost_decimals)}{''.join(proven)}."
         )
-    return tuple(lines)
 
 
 @dataclass(frozen=True)
@@ -143,11 +140,9 @@ def compared_figures(view: views.DatasetView) -> list[ComparedFigure]:
     if best is not None and best.calibrator != THEORETICAL_NAME:
         own = {result.label: best for result in published} | own
     figures = list(_compared(published, None, view.design_costs, {}))
-    for label, entry in {entry.label: entry for entry in own.values()}.items():
-        same = [result for result in published if result.label in own and own[result.label].label == label]
-        reached = {split: cost for split in view.splits if (cost := entry.costs.get(split)) is not None}
-        fell = {split: share for split in view.splits if (share := entry.improvements.get(split)) is not None}
-        figures += _compared(same, label, reached, fell)
+    for entry in {entry.label: entry for entry in own.values()}.values():
+        same = [result for result in published if own.get(result.label) is entry]
+        figures += _compared(same, entry.label, entry.costs, entry.improvements)
     return figures
 
 
@@ -155,7 +150,7 @@ def _compared(
     published: Sequence[PublishedResult],
     label: str | None,
     costs: Mapping[Split, Interval],
-    improvements: Mapping[Split, Interval],
+    improvements: Mapping[Split, Interval | None],
 ) -> Iterator[ComparedFigure]:
     """Figures of the entry called ``label``, or of the design values, beside those of published results."""
     name, kind, entry = ("theoretical", 0, "") if label is None else ("calibrated", 1, f" ({label})")
@@ -166,19 +161,22 @@ def _compared(
             words = f"{name.capitalize()} cost, {views.SPLIT_NAMES[split]}{entry}"
             yield ComparedFigure(words, costs[split], tuple(pair[kind] for pair in pairs), False, 4, methods)
         shares = tuple(share for result in published if (share := result.improvement(split)) is not None)
-        if shares and split in improvements:
+        if shares and (improvement := improvements.get(split)) is not None:
             words = f"Improvement, {views.SPLIT_NAMES[split]}{entry}"
-            yield ComparedFigure(words, improvements[split], shares, True, 2, methods)
-    known = [(costs[split].value, ends) for split in SPLITS if split in costs and (ends := costs[split].known)]
-    splits = [(result.costs("train"), result.costs("validation")) for result in published]
-    both = [(before, after) for before, after in splits if before and after]
-    if len(known) == len(SPLITS) and both:
-        change = known[1][0] / known[0][0] - 1
+            yield ComparedFigure(words, improvement, shares, True, 2, methods)
+    before, after = (costs.get(split) for split in SPLITS)
+    changes = [
+        held_out[kind] / train[kind] - 1
+        for result in published
+        if (train := result.costs("train")) and (held_out := result.costs("validation"))
+    ]
+    ends = [(each.value, *each.known) for each in (before, after) if each is not None and each.known]
+    if len(ends) == len(SPLITS) and changes:
+        change = ends[1][0] / ends[0][0] - 1
         # Both splits are samples, so that the interval of the change is about that of the two together.
-        spread = math.hypot(*((high - low) / 2 / value for value, (low, high) in known))
-        changes = tuple(later[kind] / earlier[kind] - 1 for earlier, later in both)
+        spread = math.hypot(*((high - low) / 2 / value for value, low, high in ends))
         ours = Interval(change, change - spread, change + spread)
-        yield ComparedFigure(f"Change of the {name} cost to validation{entry}", ours, changes, True, 1, methods)
+        yield ComparedFigure(f"Change of the {name} cost to validation{entry}", ours, tuple(changes), True, 1, methods)
 
 
 def _figure_table(view: views.DatasetView) -> Table:

@@ -33,9 +33,9 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
 
     brief: a line an entry, without worst errors, differences and the rows of Table 2 or 3 of the paper.
     """
-    asked = [entry for entry in view.statistics if entry.calibrator != THEORETICAL_NAME]
-    asked.sort(key=lambda entry: entry.costs[split].value if split in entry.costs else math.inf)
     design = next((entry for entry in view.statistics if entry.calibrator == THEORETICAL_NAME), None)
+    asked = [entry for entry in view.statistics if entry is not design]
+    asked.sort(key=lambda entry: entry.costs[split].value if split in entry.costs else math.inf)
     lines: list[tuple[EntryStatistics | None, Interval | None, Array | None]] = []
     lines.append((design, view.design_costs.get(split), view.design_errors[split]))
     lines += [(entry, entry.costs.get(split), view.errors(entry, split)) for entry in asked]
@@ -86,9 +86,9 @@ def cost_note(view: views.DatasetView) -> str:
     return (
         f"{paper}The cost is {name}: {costs.entry(name).summary.rstrip('.')}."
         f"{loss} Intervals: {units.ratio_words}, of the run of median training cost; differences are paired by "
-        f"{units.name}. Not told apart: the difference may be chance, or is below a "
-        "tenth of the standard error of the best entry's cost. Best: the lowest training cost of the entries that are "
-        "not known to differ from the one of lowest cost on the runs that judge."
+        f"{units.name}. Not told apart: the difference may be chance, or is below a tenth of the standard "
+        "error of the best entry's cost. Best: the lowest training cost of the entries that are not known "
+        "to differ from the one of lowest cost on the runs that judge."
     )
 
 
@@ -287,7 +287,7 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
         name = Cell(each.method, "" if each.family == "other" else each.family)
         ratio = cell.against_design(each.method, judged)
         if ratio is None:
-            rows.append(Row.of(name, *[NOTHING] * 5, each.status, NOTHING, each.reason, role="failed"))
+            rows.append(Row.of(name, *[NOTHING] * 4, each.status, NOTHING, each.reason, role="failed"))
             continue
         found, unit = "", f"; intervals by {ratio.units}"
         if each.matrix is not None:
@@ -299,8 +299,7 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
             Row.of(
                 name,
                 fixed(each.mean("cost"), 4),
-                fixed(ratio.value, 3),
-                views.interval_cell(ratio.alone, 2),
+                Cell(fixed(ratio.value, 3), views.interval_cell(ratio.alone, 2)),
                 fixed(1e3 * (each.mean("position") or 0.0), 1),
                 fixed(math.degrees(each.mean("heading") or 0.0), 2),
                 Cell("" if cell.key.fitted or ratio.equal else ratio.verdict, partly),
@@ -315,7 +314,6 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
         Column("Method", numeric=False),
         Column("Cost"),
         Column("of the design's"),
-        Column("95 % interval", priority=1),
         Column("Position", "mm", priority=1),
         Column("Heading", "°", priority=1),
         Column("Verdict", numeric=False),

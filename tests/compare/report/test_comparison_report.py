@@ -515,14 +515,14 @@ def test_figures_equal_to_ours_are_alike(two_entries: ComparisonResult) -> None:
     assert not figures(view, alike=False)
     assert len(compared_figures(view)) == 8
     real = {name: replace(dataset, simulated=False) for name, dataset in view.result.datasets.items()}
-    table, _, remarks = published_blocks(replace(view, result=with_data(view.result, real)))
+    table, _, _, remarks = published_blocks(replace(view, result=with_data(view.result, real)))
     assert remarks.items == ("A misprint.",)
     assert [row.cells[-1].text for row in table.rows] == ["as published"] * 8
     assert table.rows[0].cells[3].text == "0.0 %"
 
 
 def test_simulated_recordings_are_given_no_verdict_as_they_were_chosen(two_entries: ComparisonResult) -> None:
-    table, _ = published_blocks(with_published(two_entries, scaled(two_entries, 1.0, 1.0)))
+    table, *_ = published_blocks(with_published(two_entries, scaled(two_entries, 1.0, 1.0)))
     assert {row.cells[-1].text for row in table.rows} == {"simulated"}
     assert "agrees with them by construction" in table.note
 
@@ -544,7 +544,7 @@ def test_published_times_stand_beside_evaluations_of_the_same_methods() -> None:
         {**scaled(two_entries, 1, 1), "label": "slow", "seconds": 903, "entry": "random_search"},
         {**scaled(two_entries, 1, 1), "label": "fast", "seconds": 637, "entry": "closed_form"},
     ]
-    table, _ = published_blocks(with_published(two_entries, *both))
+    table, *_ = published_blocks(with_published(two_entries, *both))
     slow, fast = (row.cells for row in table.rows[-2:])
     evaluations = statistics(two_entries, "closed_form").evaluations_median
     assert [slow[0].text, slow[1].note, slow[2].text] == ["Time, median (random_search)", "1,001 evaluations", "903 s"]
