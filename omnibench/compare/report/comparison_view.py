@@ -72,7 +72,8 @@ class ComparisonView(Result):
             shown.append(tables.cost_table(view, view.scored, brief=not self.everything))
             if self.everything:
                 shown += [tables.cost_table(view, split) for split in view.splits[1:]]
-                shown += [tables.outcome_table(result, view.runs, every=every) for every in (False, True)]
+                ways = (False, True) if len(view.runs) > len(view.statistics) else (False,)
+                shown += [tables.outcome_table(result, view.runs, every=every) for every in ways]
         return shown
 
     def remarks(self) -> Sequence[Remark]:

@@ -118,8 +118,9 @@ def _sections(view: sets.DatasetView) -> Iterator[page.Section]:
     about = "Where the odometry ended, by commanded motion."
     yield from _folded("directions", "Errors by direction", about, *flower_figures(view))
     every = page.Details(f"Every run ({len(fits)})", (tables.outcome_table(result, fits, every=True),))
+    several = len(fits) > len(view.statistics)  # seeds of some entry
     about = "Every entry over its seeds; what no optimiser can beat; every run."
-    yield from _folded("outcomes", "Outcomes", about, tables.outcome_table(result, fits), every)
+    yield from _folded("outcomes", "Outcomes", about, tables.outcome_table(result, fits), every if several else None)
     yield from _folded("searches", "Searches", "How fast each came how near the best known cost.", *search_blocks(view))
     about = "All elements, their differences from the design values, and the wheels that they stand for."
     if view.calibrated:

@@ -48,28 +48,34 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
         position, worst = (fixed(factor * value, digits) for value in views.mean_and_worst(positions))
         heading, most = (fixed(np.degrees(value), 2) for value in views.mean_and_worst(headings))
         difference = ("", "")
-        if split == view.scored and entry is not None and entry.difference is not None and not entry.is_best:
+        if entry is not None and entry.difference is not None and not entry.is_best:
             difference = views.difference_cells(entry.difference)
         label, role = THEORETICAL_NAME if entry is None else entry.label, row_role(entry)
         colour = views.THEORETICAL_STYLE if entry is design else view.styles[label]
         reached = fixed(None if cost is None else cost.value, decimals), views.interval_cell(cost, decimals)
         fell, said = views.improvement_cells(improvement, 2), "" if entry is None else verdict(view, entry)
-        cells = [Cell(*reached), Cell(*fell), Cell(position, f"worst {worst}"), Cell(heading, f"worst {most}")]
-        shown: list[Cell | str] = [*reached, fell[0], position, heading] if brief else [*cells, Cell(*difference)]
-        rows.append(Row.of(Cell(label, "", colour.colour), *shown, said, role=role))
+        shown: list[Cell | str] = [*reached, fell[0], position, heading, said]
+        if not brief:
+            ends = [
+                Cell(now, "" if now == NOTHING else f"worst {of}") for now, of in ((position, worst), (heading, most))
+            ]
+            shown = [Cell(*reached), Cell(*fell), *ends, *([Cell(*difference), said] if split == view.scored else [])]
+        rows.append(Row.of(Cell(label, "", colour.colour), *shown, role=role))
     of_paper = [(result, ends) for result in view.config.published_results if (ends := result.costs(split))]
     if of_paper and not brief:
         rows.append(Row.of("Published, on other data: not comparable row by row", role="group"))
         for result, (before, after) in of_paper:
             theirs = Cell(fixed(after, 4), f"from {fixed(before, 4)}"), percent(result.improvement(split), 2)
-            rows.append(Row.of(Cell(result.label, result.source), *theirs, *[""] * 4, role="muted"))
-    errors_of = (Column("Position", unit, priority=2), Column("Heading", "°", priority=3))
-    middle = (Column("Cost"), Column("Improvement", priority=1), *errors_of, Column("Difference from the best"))
-    if brief:
-        middle = (Column("Cost"), Column("95 % interval", priority=4), Column("Improvement", priority=1), *errors_of)
+            blank = [""] * (len(rows[0].cells) - 3)
+            rows.append(Row.of(Cell(result.label, result.source), *theirs, *blank, role="muted"))
+    columns = [Column("Entry", numeric=False), Column("Cost"), Column("Improvement", priority=1)]
+    columns += [Column("Position", unit, priority=2), Column("Heading", "°", priority=3)]
+    columns += [Column("Difference from the best")] if split == view.scored and not brief else []
+    columns += [Column("Verdict", numeric=False)] if split == view.scored else []
+    columns[2:2] = [Column("95 % interval", priority=4)] if brief else []
     name = f"{view.name}{' (simulated)' if view.dataset.simulated else ''}"
     title = f"{name}: {view.runs_in_words(split)}, cost {view.config.objective}"
-    return Table(title, (Column("Entry", numeric=False), *middle, Column("Verdict", numeric=False)), tuple(rows))
+    return Table(title, tuple(columns), tuple(rows))
 
 
 def row_role(entry: EntryStatistics | None) -> RowRole:

@@ -233,7 +233,7 @@ def test_of_runs_whose_lengths_alone_are_known_no_heading_error_is_stated(told: 
     assert "closed_form misses the references by" in answer
     assert "°" not in answer
     assert "heading" not in answer
-    assert report.row(HELD_OUT, "closed_form")[4] == "– | worst –"
+    assert report.row(HELD_OUT, "closed_form")[4] == "–"
 
 
 def test_the_design_values_lead_the_tables_even_if_no_entry_asks_for_them(report: Page, told: Render) -> None:
@@ -311,7 +311,7 @@ def test_scans_that_cannot_be_read_cost_the_pictures_and_not_the_report(told: Re
     (tmp_path / "data" / "scans.parquet").write_bytes(b"broken")
     report = told({"room": dataset})
     assert "scans.parquet: " in report.text
-    assert report.row("Every run", "closed_form")
+    assert report.row("Outcomes and time", "closed_form")
 
 
 def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult, tmp_path: Path) -> None:
