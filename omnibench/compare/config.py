@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,7 @@ from omnibench.data.dataset import Dataset, Split
 from omnibench.data.splits import Names, training_split
 from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.errors import ConfigError, OmnibenchError, PluginError, UnknownNameError
-from omnibench.fit.calibrator import Calibrator, as_answered, unloadable
+from omnibench.fit.calibrator import as_answered, unloadable
 from omnibench.fit.geometry import GeometryLimits
 from omnibench.fit.intervals import Bootstrap
 from omnibench.fit.loss import LossName
@@ -29,7 +30,7 @@ from omnibench.fit.settings import Budget, CompleteSettings, CostChoice, objecti
 from omnibench.fit.span import Unidentified
 from omnibench.jobs.backend_choice import name_flaw
 from omnibench.jobs.job import TlsFiles
-from omnibench.registry import Entry, PluginFailure, calibrators, costs, load_plugins, plugin_text
+from omnibench.registry import PluginFailure, calibrators, costs, load_plugins, plugin_text
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.odometry import Integration
 from omnibench.simulate.source import DatasetSource
@@ -465,8 +466,14 @@ def suitable_calibrators(dataset: Dataset) -> list[str]:
 
     A matrix that is not fitted, such as a published one, is another robot's and is left out.
     """
-    entries = [entry for entry in calibrators.entries() if _suits(entry, dataset)]
-    return [THEORETICAL_NAME, *(entry.name for entry in entries if entry.name != THEORETICAL_NAME)]
+    names = [THEORETICAL_NAME]
+    for entry in calibrators.entries():
+        if not entry.cls.fitted or not calibrators.create(entry.name).applies(dataset.robot):
+            continue
+        with suppress(ConfigError):  # this robot has no such parameters
+            make_parameterisation(entry.cls.parameterisation, dataset.robot, training_split(dataset))
+            names.append(entry.name)
+    return names
 
 
 def config_in_words(config: CompareConfig) -> str:
@@ -476,14 +483,3 @@ def config_in_words(config: CompareConfig) -> str:
         f"no config is given: {names}; cost {config.objective}, at most {config.budget.evaluations:,} evaluations and "
         f"{config.budget.seconds:g} s each, one seed (config.yaml beside the results says all of it)"
     )
-
-
-def _suits(entry: Entry[Calibrator], dataset: Dataset) -> bool:
-    calibrator = entry.cls
-    if not calibrator.fitted or not calibrators.create(entry.name).applies(dataset.robot):
-        return False
-    try:
-        make_parameterisation(calibrator.parameterisation, dataset.robot, training_split(dataset))
-    except ConfigError:  # this robot has no such parameters
-        return False
-    return True

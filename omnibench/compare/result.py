@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import field_serializer
 
 from omnibench.compare.config import AS_RECORDED, CompareConfig
-from omnibench.compare.plan import ComparedRobot, PlannedFit, SearchSpace
+from omnibench.compare.plan import ComparedRobot, PlannedFit
 from omnibench.compare.ratios import CellRatio, Pairs, cell_ratio
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Split
@@ -132,11 +132,6 @@ class ScoredFit:
         """The row of a fit to a data set."""
         assert self.row is not None  # it is one
         return self.row
-
-    @property
-    def search_space(self) -> SearchSpace:
-        """The set of matrices that it chose from."""
-        return self.fit.search_space
 
     @property
     def matrix(self) -> Array | None:

@@ -57,8 +57,20 @@ def execute(
     """
     asked = [fit for fit in plan if not fit.refusal]
     runs = _Runs(asked, store, report)
+    jobs = (
+        Job(
+            run.key,
+            _solve,
+            run.task,
+            seconds=run.settings.budget.seconds + _GRACE,
+            memory_mb=run.config.memory_mb,
+            timed=run.config.timing,
+            shared=(run.training_runs,),
+        )
+        for run in asked
+    )
     with interrupts_not_in_callbacks():
-        run_jobs(map(_job, asked), store, backend, runs)
+        run_jobs(jobs, store, backend, runs)
     results = iter([runs.results[number] for number in range(len(asked))])
     return [_without_answer(Outcome.NOT_APPLICABLE, fit.refusal) if fit.refusal else next(results) for fit in plan]
 
@@ -75,18 +87,6 @@ def resumable(plan: Sequence[PlannedFit], store: ResultStore[RunResult], folder:
         if isinstance(error, BackendError):
             raise type(error)(f"{error}; {way}") from None
         raise Interrupted(f"interrupted; {way}") from None
-
-
-def _job(run: PlannedFit) -> Job[RunResult]:
-    return Job(
-        run.key,
-        _solve,
-        run.task,
-        seconds=run.settings.budget.seconds + _GRACE,
-        memory_mb=run.config.memory_mb,
-        timed=run.config.timing,
-        shared=(run.training_runs,),
-    )
 
 
 class _RunFailed(Exception):  # noqa: N818 (not an error: the outcome of a run that leaves no file)

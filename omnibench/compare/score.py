@@ -158,20 +158,16 @@ def score_fits(
         and (done.result.outcome is Outcome.CONVERGED and (score := done.scores.get("train")) is not None)
         and score.cost > score.rounding
     ]
-    return tuple(_with_gap(done, optima) for done in in_order), designs
+    for index, done in enumerate(in_order):
+        known = known_of_box(done, optima)
+        if done.row is not None and done.row.train_cost is not None and known is not None:
+            gap = {"gap": done.row.train_cost / known[1] - 1, "gap_box": known[0]}
+            in_order[index] = replace(done, row=done.row.model_copy(update=gap))
+    return tuple(in_order), designs
 
 
 def _without_answer(result: RunResult, outcome: Outcome, reason: str) -> RunResult:
     return replace(result, outcome=outcome, reason=reason, vector=None, matrix=None, cost=None)
-
-
-def _with_gap(done: ScoredFit, optima: Sequence[tuple[PlannedFit, tuple[str, float]]]) -> ScoredFit:
-    """The run with its gap above the first optimum that it can be compared with."""
-    known = known_of_box(done, optima)
-    if done.row is None or done.row.train_cost is None or known is None:
-        return done
-    box, lowest = known
-    return replace(done, row=done.row.model_copy(update={"gap": done.row.train_cost / lowest - 1, "gap_box": box}))
 
 
 def known_of_box(done: ScoredFit, others: Iterable[tuple[PlannedFit, T]]) -> T | None:

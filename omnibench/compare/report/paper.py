@@ -81,7 +81,7 @@ def _claims(view: views.DatasetView) -> Iterator[str]:
     costs_of: dict[str, list[float]] = {}
     for run in view.runs:
         record = run.record
-        rival = record.label != genetic.record.label and run.search_space == genetic.search_space
+        rival = record.label != genetic.record.label and run.fit.search_space == genetic.fit.search_space
         if rival and calibrators.entry(record.calibrator).cls.stochastic and record.train_cost is not None:
             costs_of.setdefault(record.label, []).append(record.train_cost)
     if costs_of:

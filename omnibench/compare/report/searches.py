@@ -68,16 +68,16 @@ def courses(view: DatasetView) -> list[Course]:
         if view.config.loss != "squares":  # by which answers are not scored: the best one of the search
             reached = min((step.cost for step in history), default=None)
         if reached is not None:  # the answer stands at the run's total evaluations
-            lowest[run.search_space] = min(lowest.get(run.search_space, math.inf), reached)
+            lowest[run.fit.search_space] = min(lowest.get(run.fit.search_space, math.inf), reached)
             last = min([reached, *(step.cost for step in history)])
             history.append(Improvement(max(record.evaluations, 1), record.seconds, last))
         found.append((run, history))
     drawn = []
     for run, history in found:
-        record, best_known = run.record, lowest.get(run.search_space, math.inf)
+        record, best_known = run.record, lowest.get(run.fit.search_space, math.inf)
         if record.gap is not None and record.train_cost is not None:
             best_known = record.train_cost / (1 + record.gap)
-        searched = record.evaluations > 1 and run.search_space.bounded and history
+        searched = record.evaluations > 1 and run.fit.search_space.bounded and history
         if searched and run.scores["train"].rounding < best_known < math.inf:
             evaluations = np.array([step.evaluations for step in history], dtype=float)
             drawn.append(Course(run, evaluations, np.array([step.cost for step in history]), best_known))
