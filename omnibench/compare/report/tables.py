@@ -54,14 +54,14 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
         colour = views.THEORETICAL_STYLE if entry is design else view.styles[label]
         reached = fixed(None if cost is None else cost.value, decimals), views.interval_cell(cost, decimals)
         fell, said = views.improvement_cells(improvement, 2), "" if entry is None else verdict(view, entry)
-        shown: list[Cell | str] = [*reached, fell[0], position, heading, said]
-        if not brief:
-            ends = [
-                Cell(now, "" if now == NOTHING else f"worst {of}") for now, of in ((position, worst), (heading, most))
-            ]
-            shown = [Cell(*reached), Cell(*fell), *ends, *([Cell(*difference), said] if split == view.scored else [])]
+        finals = ((position, worst), (heading, most))
+        ends = [Cell(mean, "" if mean == NOTHING else f"worst {largest}") for mean, largest in finals]
+        judged: list[Cell | str] = [Cell(*difference), said] if split == view.scored else []
+        shown: list[Cell | str] = [Cell(*reached), Cell(*fell), *ends, *judged]
+        if brief:
+            shown = [*reached, fell[0], position, heading, said]
         rows.append(Row.of(Cell(label, "", colour.colour), *shown, role=role))
-    of_paper = [(result, ends) for result in view.config.published_results if (ends := result.costs(split))]
+    of_paper = [(result, pair) for result in view.config.published_results if (pair := result.costs(split))]
     if of_paper and not brief:
         rows.append(Row.of("Published, on other data: not comparable row by row", role="group"))
         for result, (before, after) in of_paper:
