@@ -261,12 +261,10 @@ def cell_table(result: ComparisonResult) -> pl.DataFrame:
 
 
 def _cell_row(result: ComparisonResult, cell: Cell, method: MethodInCell) -> dict[str, Any]:
-    key = cell.key
     ratio = cell.against_design(method.method, len(result.judged_cells))
     heading = method.mean("heading")
-    return {
-        "robot": key.robot, "training": key.training, "regime": key.regime, "judged": key.judged, "fitted": key.fitted,
-        "simulated": result.datasets[key.robot].simulated, "method": method.method, "family": method.family,
+    return asdict(cell.key) | {
+        "simulated": result.datasets[cell.key.robot].simulated, "method": method.method, "family": method.family,
         "status": method.status, "reason": method.reason, "fits": method.fits, "answers": method.answers,
         "runs": len(set(cell.pairs.runs.tolist())), "sessions": cell.pairs.sessions, "cost": method.mean("cost"),
         "position_m": method.mean("position"), "heading_deg": None if heading is None else math.degrees(heading),

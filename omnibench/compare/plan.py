@@ -108,19 +108,6 @@ UNBOUNDED = "none"
 
 
 @dataclass(frozen=True)
-class SearchSpace:
-    """A set of matrices to choose from: equal where two runs searched the same set.
-
-    limits: the box of the matrix elements, or the limits of the geometry. bounded: False where the answer does not
-    keep to them.
-    """
-
-    parameterisation: ParameterisationName
-    limits: Box | GeometryLimits
-    bounded: bool
-
-
-@dataclass(frozen=True)
 class FitTask:
     """The part of a fit that its worker process is sent: the training data, and nothing of the validation data.
 
@@ -362,11 +349,15 @@ class PlannedFit:
         return self.settings.box if searched else None
 
     @property
-    def search_space(self) -> SearchSpace:
-        """The set of matrices that the fit chooses from."""
+    def search_space(self) -> tuple[ParameterisationName, Box | GeometryLimits, bool]:
+        """The set of matrices that the fit chooses from: equal where two fits searched the same set.
+
+        Its parameterisation, the box of matrix elements or the limits of the geometry, and whether the answer keeps to
+        them.
+        """
         settings = self.settings
         limits = (settings.limits or GeometryLimits()) if settings.parameterisation == "geometry" else settings.box
-        return SearchSpace(settings.parameterisation, limits, self.box_name != UNBOUNDED)
+        return settings.parameterisation, limits, self.box_name != UNBOUNDED
 
     @property
     def task(self) -> FitTask:
@@ -492,7 +483,9 @@ def _with_settings(
         with suppress(PluginError):  # a constructor that raises is the outcome of the fit
             refusal = refusal_of(calibrators.create(entry.name, entry.options), dataset.robot, runs)
     try:
-        box_name = UNBOUNDED if refusal else name_of_bounds(settings, dataset.robot, runs)
+        if not refusal and calibrators.entry(entry.name).cls.bounded:
+            searched, box, limits = settings.parameterisation, settings.box, settings.limits
+            box_name = make_parameterisation(searched, dataset.robot, runs, box=box, limits=limits).bounds.name
     except ConfigError as error:
         if config.datasets:
             raise ConfigError(f"config {config.name}: calibrator {entry.name!r}: {error}") from None
@@ -503,11 +496,3 @@ def _with_settings(
     elif not entry.label and entry.box is not None and entry.box != config.box:
         label += f" ({box_name} box)"
     return PlannedFit(config, robot, training, fold, regime, entry, dataset, runs, settings, label, box_name, refusal)
-
-
-def name_of_bounds(settings: CompleteSettings, robot: Robot, training: Sequence[Trajectory]) -> str:
-    """The name of the bounds that a fit searches, or ``UNBOUNDED``. ConfigError: the robot has no such parameters."""
-    if not calibrators.entry(settings.calibrator).cls.bounded:
-        return UNBOUNDED
-    box, limits = settings.box, settings.limits
-    return make_parameterisation(settings.parameterisation, robot, training, box=box, limits=limits).bounds.name

@@ -309,33 +309,21 @@ def ranking(cells: Sequence[Cell], methods: Sequence[str]) -> Ranking | None:
     return Ranking(tuple(names[index] for index in order), ordered, count, p_value, difference, tuple(spans))
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Performance profile of a method: the errors' ratios to the best in each cell, sorted, those of answers only."""
+def profiles(cells: Sequence[Cell], methods: Sequence[str], factors: Array) -> dict[str, Array]:
+    """Performance profiles: the share (F,) of cells in which a method's error is at most ``factors`` times the best.
 
-    method: str
-    ratios: Array
-    cells: int
-
-    def share(self, factor: float) -> float:
-        """The share of all cells in which its error is at most ``factor`` times the best."""
-        return float(np.searchsorted(self.ratios, factor * (1 + 1e-12), side="right")) / self.cells
-
-
-def profiles(cells: Sequence[Cell], methods: Sequence[str]) -> tuple[Profile, ...]:
-    """The profile of every method that was asked in all cells and answered in some."""
-    best = [
-        min((mean for each in cell.methods.values() if (mean := each.mean("cost")) is not None), default=math.inf)
-        for cell in cells
-    ]
-    made = []
+    Of every method that was asked in all cells and answered in some.
+    """
+    shares = {}
     for name in methods:
         if not all(name in cell.methods for cell in cells):
             continue
-        means = [cell.methods[name].mean("cost") for cell in cells]
-        ratios = [
-            mean / lowest if lowest > 0 else 1.0 for mean, lowest in zip(means, best, strict=True) if mean is not None
-        ]
-        if ratios:
-            made.append(Profile(name, np.sort(ratios), len(cells)))
-    return tuple(made)
+        ratios = np.full(len(cells), np.inf)
+        for number, cell in enumerate(cells):
+            mean = cell.mean(name)
+            if mean is not None:
+                best = min(other for each in cell.methods.values() if (other := each.mean("cost")) is not None)
+                ratios[number] = mean / best if best > 0 else 1.0
+        if np.isfinite(ratios).any():
+            shares[name] = np.mean(ratios[:, None] <= factors * (1 + 1e-12), axis=0)
+    return shares

@@ -399,10 +399,8 @@ def test_a_method_without_an_answer_in_one_cell_has_no_rank_but_a_profile() -> N
     cells = [cell(a=1.0, b=2.0, c=4.0, d=None), cell(a=2.0, b=1.0, c=4.0, d=0.5)]
     ranked = ranking(cells, ("a", "b", "c", "d"))
     assert set(ranked.methods) == {"a", "b", "c"}
-    shares = {
-        each.method: (each.share(1.0), each.share(2.0), each.share(100.0)) for each in profiles(cells, ("a", "d"))
-    }
-    assert shares == {"a": (0.5, 0.5, 1.0), "d": (0.5, 0.5, 0.5)}
+    shares = profiles(cells, ("a", "d"), np.array([1.0, 2.0, 100.0]))
+    assert {name: share.tolist() for name, share in shares.items()} == {"a": [0.5, 0.5, 1.0], "d": [0.5, 0.5, 0.5]}
 
 
 def test_two_methods_have_no_ranks() -> None:

@@ -148,10 +148,7 @@ def rank_blocks(result: ComparisonResult, cells: Sequence[Cell]) -> Iterator[pag
         height = 90 + 24 * (rows + len(ranked.groups))
         picture = page.Figure("Mean ranks of methods", figure, "; ".join(words), height)
         yield page.FigureGrid((picture,), (_ALIKE,) if ranked.groups else (), 1, caption, "ranks")
-    shares = {
-        drawn[each.method]: (_FACTORS, np.array([each.share(factor) for factor in _FACTORS]))
-        for each in profiles(cells, tuple(drawn))
-    }
+    shares = {drawn[name]: (_FACTORS, share) for name, share in profiles(cells, tuple(drawn), _FACTORS).items()}
     if shares:
         caption = "The higher, the more often a method is near the best one of a cell; at 1: how often it is the best."
         axes = ("error as a multiple of the best in the cell", "share of the cells (%)")

@@ -13,13 +13,13 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.plan import SearchSpace
+from omnibench.compare.plan import UNBOUNDED
 from omnibench.compare.report.charts import share_chart
 from omnibench.compare.report.view import DatasetView
 from omnibench.compare.result import ScoredFit
@@ -60,7 +60,7 @@ def courses(view: DatasetView) -> list[Course]:
 
     Runs that evaluated one candidate at most, and those whose answer keeps to no box, did not search.
     """
-    lowest: dict[SearchSpace, float] = {}
+    lowest: dict[Hashable, float] = {}  # by the set that was searched
     found = []
     for run in view.runs:
         record, history = run.record, list(run.result.history)
@@ -77,7 +77,7 @@ def courses(view: DatasetView) -> list[Course]:
         record, best_known = run.record, lowest.get(run.fit.search_space, math.inf)
         if record.gap is not None and record.train_cost is not None:
             best_known = record.train_cost / (1 + record.gap)
-        searched = record.evaluations > 1 and run.fit.search_space.bounded and history
+        searched = record.evaluations > 1 and run.fit.box_name != UNBOUNDED and history
         if searched and run.scores["train"].rounding < best_known < math.inf:
             evaluations = np.array([step.evaluations for step in history], dtype=float)
             drawn.append(Course(run, evaluations, np.array([step.cost for step in history]), best_known))
