@@ -98,7 +98,12 @@ def _of_datasets(result: ComparisonResult) -> Iterator[page.Section]:
         return
     sentence = f"Calibrators compared on {plural(len(views), 'data set')}; each has a part of its own below."
     costs = (tables.cost_table(view, view.scored, brief=True) for view in views)
-    yield page.answer_section(sentence, (), path_picture(views[0]), *costs)
+    tiles = [
+        page.Fact(f"{view.name}: the cost fell by", sets.improvement_cells(share, 1)[0], view.best.label)
+        for view in views
+        if view.best is not None and (share := view.best.improvements[view.scored]) is not None
+    ]
+    yield page.answer_section(sentence, tiles, path_picture(views[0]), *costs)
     for index, view in enumerate(views, 1):
         parts = tuple(replace(section, key=f"data-{index}-{section.key}") for section in _sections(view))
         badges = page.simulated_badge(view.dataset.simulated)

@@ -199,8 +199,9 @@ def _figure_table(view: views.DatasetView) -> Table:
                 "simulated" if view.dataset.simulated else verdict,
             )
         )
+    one_machine = view.config.timing and len({run.record.machine for run in view.runs if run.record.machine}) < 2
     for result, entry, _ in view.published_entries:
-        if result.seconds is not None:
+        if result.seconds is not None and one_machine:  # else times do not compare
             here = Cell(seconds(entry.seconds_median), f"{count(entry.evaluations_median)} evaluations")
             theirs_took = Cell(seconds(result.seconds), result.label)
             rows.append(Row.of(f"Time, median ({entry.label})", here, theirs_took, NOTHING, "other hardware, program"))
