@@ -35,7 +35,7 @@ class RandomSearch(LibrarySearch):
     [
         ("dual_annealing", "scipy"),
         ("pymoo_pso", "pymoo"),
-        pytest.param("nevergrad_ngopt", "nevergrad", marks=pytest.mark.slow),
+        pytest.param("nevergrad_de", "nevergrad", marks=pytest.mark.slow),
         pytest.param("optuna_tpe", "optuna", marks=pytest.mark.slow),
     ],
 )
