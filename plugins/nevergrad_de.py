@@ -1,6 +1,6 @@
 """Nevergrad's differential evolution: Rapin and Teytaud, Nevergrad (2018)."""
 
-from numpy.random import Generator
+from numpy.random import Generator, RandomState
 
 from omnibench.fit.library_search import LibrarySearch, UnitCost
 from omnibench.registry import calibrators
@@ -18,7 +18,7 @@ class NevergradDe(LibrarySearch):
         import nevergrad
 
         point = nevergrad.p.Array(init=start).set_mutation(sigma=1 / 6).set_bounds(0.0, 1.0)
-        point.random_state.seed(int(rng.integers(2**31)))
+        point.random_state = RandomState(int(rng.integers(2**31)))
         optimiser = nevergrad.optimizers.TwoPointsDE(point, budget=10_000)
         for _ in range(optimiser.budget):
             candidate = optimiser.ask()
