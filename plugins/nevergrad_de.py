@@ -17,8 +17,9 @@ class NevergradDe(LibrarySearch):
         """Nevergrad is asked and told. (Its NGOpt builds models that take minutes on nine elements.)"""
         import nevergrad
 
-        point = nevergrad.p.Array(init=start).set_mutation(sigma=1 / 6).set_bounds(0.0, 1.0)
+        point = nevergrad.p.Array(init=start).set_mutation(sigma=1 / 6)
         point.random_state = RandomState(int(rng.integers(2**31)))
+        point.set_bounds(0.0, 1.0)  # draws a state of NumPy's where there is none
         optimiser = nevergrad.optimizers.TwoPointsDE(point, budget=10_000)
         for _ in range(optimiser.budget):
             candidate = optimiser.ask()
