@@ -55,4 +55,3 @@ def test_an_optimiser_sees_finite_costs_where_there_are_none_and_answers_no_wors
     assert result.outcome is Outcome.CONVERGED
     assert result.reason == "numpy: 1,000 points"
     assert result.cost <= problem.values(problem.start[None])[0]
-
