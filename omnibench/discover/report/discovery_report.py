@@ -71,14 +71,18 @@ def _tiles(discovery: Discovery) -> Iterator[page.Fact]:
     if held is not None:
         where, gap = tables.held_out_runs(discovery, held), held.eq6
         for name, before, after in tables.final_errors(held):
-            yield page.Fact(name, f"{before} → {after}" if discovery.extends else before, where)
+            yield page.Fact(name, f"{before.split()[0]} → {after}" if discovery.extends else before, where)
     before, after, floor = tables.gap_values(gap)
     if discovery.extends:
         note = f"{before} → {after}, floor {floor}; {where}"
-        yield page.Fact("Gap closed, Eq. (6)", tables.closed_share(gap), note)
+        yield page.Fact(f"Gap closed, {tables.METRICS[gap.metric]}", tables.closed_share(gap), note)
     else:
-        yield page.Fact("Eq. (6)", before, f"floor {floor}; {where}")
+        yield page.Fact(tables.METRICS[gap.metric], before, f"floor {floor}; {where}")
     verdict = tables.verdict_in_words(discovery)
+    if discovery.verdict == "unknown" and discovery.effects:
+        verdict = "likeliest, but no name is sure"
+    elif discovery.verdict == "unknown" and discovery.extends:
+        verdict += "; an unnamed term closes of the gap what is shown"
     if discovery.sessions.differences or discovery.sessions.doubts:
         verdict += ", sessions differ" if discovery.sessions.differences else ", sessions not compared"
     if not discovery.effects:

@@ -104,7 +104,8 @@ def answer(discovery: result.Discovery) -> str:
     for effect in discovery.effects:
         entry = effects.entry(effect.name)
         what = entry.summary.partition(":")[0].rstrip(".") if entry.cls.in_catalogue else "Something that has no name"
-        causes.append(f"{what} ({effect.name.replace('_', ' ')}).")
+        alike = f"; it may as well be {' or '.join(effect.confusable_with)}" if effect.confusable_with else ""
+        causes.append(f"{what} ({effect.name}{alike}).".replace("_", " "))
     gain = "No run was held out to show what that gains."
     if (held := decisive(discovery)) is not None:
         before, after = (

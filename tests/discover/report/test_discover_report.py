@@ -138,6 +138,15 @@ def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> N
     assert EXPERIMENT.config in told.text
 
 
+def test_the_first_screen_says_how_sure_the_cause_is() -> None:
+    effect = replace(named().effects[0], weight=0.52, confusable_with=("load_transfer",))
+    alike = whole(lambda: replace(named(), verdict="class", effects=(effect,))).text
+    assert "(rotation translation coupling; it may as well be load transfer)" in alike
+    assert "found; which of a class is open; weight of the name 52.0 %" in alike
+    assert "likeliest, but no name is sure" in whole(lambda: replace(named(), verdict="unknown")).text
+    assert "an unnamed term closes" in whole(lambda: replace(named(), verdict="unknown", effects=())).text
+
+
 def test_errors_before_and_after_stand_beside_the_floor(report: Page) -> None:
     rows = report.tables["On held-out runs"]
     session = held_out(named(), "session")

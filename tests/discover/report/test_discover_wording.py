@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from discovery_samples import held_out, named
 
-from omnibench.discover.report.figures import PLAIN, Curve, Panel, grid
+from omnibench.discover.report.figures import PLAIN, Curve, Panel, error_grid, grid
 from omnibench.discover.report.tables import (
     answer,
     chance,
@@ -87,6 +87,17 @@ def test_a_cause_that_is_not_sure_is_said_to_be_the_likeliest() -> None:
     doubtful = replace(found, effects=(replace(effect, class_weight=0.5),))
     assert not answer(found).startswith("Likeliest")
     assert answer(doubtful) == f"Likeliest, but not sure: {answer(found)}"
+
+
+def test_the_errors_after_each_effect_stand_between_the_plain_matrix_and_the_extended_model() -> None:
+    found = named()
+    first, last = found.steps
+    between = replace(last, name="+ wheel_dead_zone", eq6_held_out=0.02, held_out=9.0)
+    found = replace(found, steps=(first, between, last))
+    bars = [[trace.y[0] for trace in figure.plot.data] for figure in error_grid(found).figures]
+    assert bars[0] == ["plain matrix", "+ wheel_dead_zone", "extended model", "floor"]
+    unknown = replace(found, steps=(first, replace(between, eq6_held_out=None, held_out=None), last))
+    assert [trace.y[0] for trace in error_grid(unknown).figures[0].plot.data] == [bars[0][0], *bars[0][2:]]
 
 
 def scale_of(values: list[float], half_width: list[float]) -> float:
