@@ -100,16 +100,6 @@ def print_next(result: Result) -> None:
     print_ending(step.outcome, step.then, *step.command)
 
 
-def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:
-    """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are.
-
-    sessions: sentences on sessions that differ from the others or could not be compared.
-    """
-    for sentence in (f"{subject}{verdict.sentence}", verdict.detail, *sessions):
-        if sentence:
-            say(sentence)
-
-
 def print_ending(outcome: str, then: str = "", *command: object) -> None:
     """The sentence that a command ends with, on standard error, so that what is piped stays clean.
 
