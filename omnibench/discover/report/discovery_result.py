@@ -21,7 +21,7 @@ from omnibench.words import kind_of_data, plural
 _HIDDEN = 4  # lines of effects that could still hide
 _MOST_DEPENDENCES = 4  # lines of covariates that the residuals depend on
 _PARAMETERS = 9  # lines for an effect
-_LINES = 3  # notes, and as many warnings
+_LINES = 3  # notes, and as many motions that were not driven in training
 _COLUMNS = {
     **dict.fromkeys(("effect", "stage"), pl.String),
     "weight": pl.Float64,
@@ -102,8 +102,9 @@ class DiscoveryResult(Result):
         if discovery.absorbed:
             yield f"Absorbed by any matrix, and so never named: {', '.join(discovery.absorbed)}."
         yield from (f"- {note}" for note in discovery.notes[:_LINES])
-        if len(discovery.notes) > _LINES:
-            yield f"{plural(len(discovery.notes) - _LINES, 'more remark')} in the report"
+        more = sum(max(0, len(lines) - _LINES) for lines in (discovery.notes, discovery.extrapolations))
+        if more:
+            yield f"{plural(more, 'more remark')} in the report"
         if self.folder is not None:
             kind = "extended" if discovery.extends else "plain"
             what = "extended calibration" if discovery.extends else "plain calibration, as nothing was added"
