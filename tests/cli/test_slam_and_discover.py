@@ -471,7 +471,7 @@ def many_notes() -> Discovery:
 
 
 DRIVE = ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")
-LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")
+LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "v0.4_a90_w1 turns at 1.0 rad/s", "experiment-1.yaml")
 SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
     named: ("(simulated data): 36 training runs", "verdict: named", "held-out session: 36 runs", "now/model.yaml"),
     nameless: ("verdict: unknown",),

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.segment import Segment
 
     from omnibench.report.result import Result
-    from omnibench.robot.calibration import HeldOutVerdict
 
 _MOST_ALIKE = 3  # warnings that differ by places and numbers alone and are shown one by one
 _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's window is too narrow
