@@ -181,7 +181,6 @@ class Details:
     kind: ClassVar[str] = "details"
     title: str
     blocks: tuple[Block, ...]
-    open: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,9 +33,7 @@ from omnibench.words import plural
 
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
 _ROWS = (("x", "m/rad"), ("y", "m/rad"), ("w", "rad/rad"))
-_COLUMNS = 3  # drive signals whose elements stand side by side in 80 columns; of more, each has a row
-_SCREEN, _WIDTH = 25, 80  # lines and columns of a terminal that hold the answer
-_ENDING = (96 * ".", "COMMAND")  # as long as the sentence that a command ends with
+_SCREEN = 12  # rows of parameters and elements, of which a terminal of 25 lines holds all that is said; chosen
 _TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
 _FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
 _MODELS: tuple[Literal["design", "calibration"], ...] = ("design", "calibration")
@@ -61,15 +60,15 @@ class CalibrationResult(Result):
         self.box = "" if box is None else f" {box!r}"
         self.run = shown if isinstance(shown, CalibrationRun) else None
         self.calibration = shown.calibration if isinstance(shown, CalibrationRun) else shown
-        origin = self.calibration.provenance
-        self.verdict = verdict or (None if origin is None else origin.held_out)
         self.dataset, self.file, self.sources, self.again = dataset, file, sources, again
-        self.parameters = _physical(self.calibration)
+        name, robot, origin = self.calibration.name, self.calibration.robot.name, self.calibration.provenance
+        self.verdict = verdict or (None if origin is None else origin.held_out)
+        try:
+            self.parameters: Mapping[str, PhysicalParameter] = self.calibration.physical_parameters
+        except DataError:  # no wheels near the design have this matrix
+            self.parameters = {}
         fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
-        self.heading = (
-            f"{self.calibration.name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
-        )
-        name, robot = self.calibration.name, self.calibration.robot.name
+        self.heading = f"{name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
         self.title = f"{type(shown).__name__} {name!r} of robot {robot}{fitted}"
 
     @property
@@ -96,24 +95,19 @@ class CalibrationResult(Result):
         return next_step(self.calibration, self.verdict, self.file, self.sources)
 
     def tables(self) -> Sequence[page.Table]:
-        """Parameters, and the matrix as far as a screen holds both."""
+        """Parameters, and the elements of the matrix as far as a screen holds both."""
         if not self.parameters:
-            return [self._elements()]
-        tables = [parameter_table(self.calibration, self.heading), self.matrix_table()]
-        lines = [*self.warnings, *(remark.text for remark in self._beside), *_ENDING]
-        height = sum(-(-len(line) // _WIDTH) for line in lines) + sum(2 + len(table.rows) for table in tables)
-        return tables if height <= _SCREEN else tables[:1]
+            return [self.elements()]
+        tables = [parameter_table(self.calibration, self.heading), self.elements("matrix")]
+        rows = sum(len(table.rows) for table in tables) + 2 * len(self.warnings)
+        return tables if rows <= _SCREEN else tables[:1]
 
     def remarks(self) -> Sequence[Remark]:
-        if len(self.tables()) == 2 or not self.parameters:
-            return self._beside
-        size = f"3 x {len(self.calibration.matrix[0])}"
-        return [Remark(f"matrix ({size}): not on this screen; --json shows it, -o writes it"), *self._beside]
-
-    @property
-    def _beside(self) -> list[Remark]:
-        """What is said below the tables, whether or not the matrix is among them."""
         lines, run = list[str](), self.run
+        if self.parameters and len(self.tables()) < 2:
+            size = f"3 x {len(self.calibration.matrix[0])}"
+            lines.append(f"matrix ({size}): not on this screen; --json shows it, -o writes it")
+            lines += filter(None, [self._kept])
         if run is not None and run.uncertainty is not None:
             lines.append(f"95 % intervals: {run.uncertainty.source}")
         if run is not None and run.result.outcome != "converged":
@@ -128,22 +122,19 @@ class CalibrationResult(Result):
     def document(self) -> page.Document:
         assert self.dataset is not None
         warnings = self.run.warnings if self.run else ()
-        return calibration_document(self.calibration, self.dataset, self.verdict or _NOT_JUDGED, warnings)
+        return calibration_document(self.run or self.calibration, self.dataset, self.verdict or _NOT_JUDGED, warnings)
 
-    def matrix_table(self) -> page.Table:
-        """The matrix with its deviation from the design values: a column a drive signal, of more than three a row."""
-        calibration, drive = self.calibration, self.calibration.robot.drive
-        shares = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
-        cells = [
-            [page.Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(*row, strict=True)]
-            for row in zip(calibration.matrix, shares, strict=True)
-        ]
-        headings = [f"wheel {name}" if drive.direct else name for name in drive.names]
-        labels = [f"{row} ({unit})" for row, unit in _ROWS]
-        if len(headings) > _COLUMNS:
-            headings, labels, cells = labels, headings, [list(column) for column in zip(*cells, strict=True)]
-        rows = tuple(page.Row.of(label, *row) for label, row in zip(labels, cells, strict=True))
-        return page.Table("", page.columns("matrix", *headings), rows, self._kept)
+    def elements(self, heading: str = "") -> page.Table:
+        """The elements of the matrix beside the design, with their intervals, as parameters are shown."""
+        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
+        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
+        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
+            low, high = row.get("low"), row.get("high")
+            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
+            values = (f"{row[name]:+.7f}" for name in ("design", "value"))
+            change = "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"
+            rows.append((f"{row['row']}: {row['signal']}", *values, row["unit"], change, interval))
+        return _values_table(heading or self.heading, rows, self._kept)
 
     @property
     def _kept(self) -> str:
@@ -151,17 +142,6 @@ class CalibrationResult(Result):
         kept = () if self.run is None else self.run.kept
         motions = " and ".join(f"{each.words} ({each.motion})" for each in kept)
         return f"the design values are kept along {motions}, of which these data say nothing" if kept else ""
-
-    def _elements(self) -> page.Table:
-        """The elements of a matrix that has no reading as parameters, as parameters are shown."""
-        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
-        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
-        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
-            low, high = row.get("low"), row.get("high")
-            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
-            values = (f"{row[name]:+.7f}" for name in ("design", "value"))
-            rows.append((f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(float(share)), interval))
-        return _values_table(self.heading, rows, self._kept)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         return {"matrix": self._matrix, "parameters": self._parameters}
@@ -227,26 +207,24 @@ class CalibrationResult(Result):
         )
 
 
+@dataclass(eq=False, repr=False)
 class EvaluationResult(Result):
     """An evaluation: errors on every split beside those of the design, and errors to expect on paths.
 
     evaluation: None where only paths were asked for. The other arguments are those of a calibration's result.
     """
 
-    def __init__(
-        self,
-        evaluation: Evaluation | None,
-        calibration: Calibration | None = None,
-        paths: Sequence[PathError] = (),
-        dataset: Dataset | None = None,
-        file: Path | None = None,
-        sources: Sequence[Path] = (),
-        warnings: Sequence[str] = (),
-    ) -> None:
-        self.evaluation, self.calibration, self.paths, self.dataset = evaluation, calibration, paths, dataset
-        self.file, self.sources, self.warnings = file, sources, warnings
-        if evaluation is not None:
-            self.title = f"Evaluation on {evaluation.dataset!r}, {plural(evaluation.trajectories, 'run')}"
+    evaluation: Evaluation | None
+    calibration: Calibration | None = None
+    paths: Sequence[PathError] = ()
+    dataset: Dataset | None = None
+    file: Path | None = None
+    sources: Sequence[Path] = ()
+    warnings: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.evaluation is not None:
+            self.title = f"Evaluation on {self.evaluation.dataset!r}, {plural(self.evaluation.trajectories, 'run')}"
 
     def sentence(self) -> str:
         return "" if self.evaluation is None else self.evaluation.held_out.sentence
@@ -351,14 +329,6 @@ def verdict_remarks(verdict: HeldOutVerdict | None) -> list[Remark]:
     return [Remark(verdict.sentence, _TONES[verdict.verdict]), *([Remark(detail)] if detail else [])]
 
 
-def _physical(calibration: Calibration) -> Mapping[str, PhysicalParameter]:
-    """The physical parameters; none where no wheels near the design have the matrix."""
-    try:
-        return calibration.physical_parameters
-    except DataError:
-        return {}
-
-
 def _models(calibration: Calibration, dataset: Dataset) -> Models:
     """The design and the calibration."""
     design = OdometryModel.of_design(dataset.robot, calibration.integration)
@@ -366,7 +336,7 @@ def _models(calibration: Calibration, dataset: Dataset) -> Models:
 
 
 def calibration_document(
-    calibration: Calibration, dataset: Dataset, verdict: HeldOutVerdict, warnings: Sequence[str] = ()
+    found: Calibration | CalibrationRun, dataset: Dataset, verdict: HeldOutVerdict, warnings: Sequence[str] = ()
 ) -> page.Document:
     """The report of a calibration on the runs of a data set: on those that the verdict is of, or else on all.
 
@@ -374,7 +344,8 @@ def calibration_document(
     """
     judged = [run for run in dataset.trajectories if run.id in set(verdict.runs)]
     runs, which = (judged, "held-out") if judged else (list(dataset.trajectories), "recorded")
-    models, shown = _models(calibration, dataset), CalibrationResult(calibration)
+    shown = CalibrationResult(found)
+    calibration, models = shown.calibration, _models(shown.calibration, dataset)
     errors = [final_errors(model, runs) for _, model in models]
     by_motion = [_error_cells(errors, indices) for indices in ([*range(len(runs))], *kinds_of(runs).values())]
     (_, *means), names = by_motion[0], ("all", *kinds_of(runs))
@@ -422,7 +393,7 @@ def calibration_document(
                 page.Callout("What these data leave open", tuple(map(typeset, warnings)), "warning"),
             ),
             *sections,
-            page.Section("matrix", "The matrix", (shown.deviations(), shown.matrix_table())),
+            page.Section("matrix", "The matrix", (shown.deviations(), shown.elements("element"))),
             page.Section("origin", "How it was made", (page.Facts(tuple(facts)),)),
         ),
         badges=page.simulated_badge(dataset.simulated),
@@ -527,7 +498,3 @@ def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Ta
 def _figures(value: float) -> str:
     """A number with two figures, or all before its point."""
     return f"{value:.1f}" if value < 10 else f"{value:.0f}"
-
-
-def _deviation(share: float) -> str:
-    return "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"

@@ -44,8 +44,7 @@ class RobotResult(Result):
     def figures(self) -> Sequence[FigureGrid]:
         if not is_drawn(self.robot):
             raise DataError(f"robot {self.robot.name}: where its wheels stand is not said, so that it cannot be drawn")
-        figure, items = motion_system(self.robot)
-        return [FigureGrid((figure,), tuple(items), 1)]
+        return [motion_system(self.robot)]
 
 
 class DatasetResult(Result):

@@ -254,6 +254,7 @@ _WHEELS = page.LegendItem("wheels", "by the wheels, at the design", PALETTE[0])
 _REFERENCE = page.LegendItem("reference", "by the reference", REFERENCE)
 _SMOOTH = 0.3  # s over which rates of turn are taken, so that the reference's noise does not hide them; chosen
 _SHOWN = 12.0  # s that are drawn, where matching shows best; chosen
+_LOOKED_AT = 8  # runs whose clocks are farthest off, of which the one is drawn that shows it best; chosen
 
 
 def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
@@ -289,36 +290,33 @@ def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
 def _clock_picture(
     robot: Robot, runs: Sequence[Trajectory], clocks: Sequence[ClockMatch | None]
 ) -> page.FigureGrid | None:
-    """Rates of turn by wheels and reference in the run whose clock is farthest off, before and after matching."""
+    """Rates of turn by wheels and reference where matching their clocks shows best, before and after it."""
     known = [(run, clock) for run, clock in zip(runs, clocks, strict=True) if clock is not None]
     if not known:
         return None
-    run, clock = max(
-        known, key=lambda each: max(abs(each[1].offset), abs(each[1].offset + each[1].drift * each[1].length))
-    )
-    moments, edges = np.arange(0.0, run.times[-1], _SMOOTH / 3), np.append(0.0, run.times)
-    turns = np.append(0.0, np.cumsum((run.signals @ robot.inverse_kinematic_matrix[2]) * np.diff(edges)))
-    wheels, before, after = (
-        (np.interp(moments + _SMOOTH / 2, times, turned) - np.interp(moments - _SMOOTH / 2, times, turned)) / _SMOOTH
-        for times, turned in (
-            (edges, turns),
-            (run.pose_times, run.poses[:, 2]),
-            (clock.corrected(run.pose_times), run.poses[:, 2]),
+    off = [max(abs(clock.offset), abs(clock.offset + clock.drift * clock.length)) for _, clock in known]
+    views = []
+    for run, clock in (known[index] for index in np.argsort(-np.array(off), kind="stable")[:_LOOKED_AT]):
+        moments, edges = np.arange(0.0, run.times[-1], _SMOOTH / 3), np.append(0.0, run.times)
+        turns = np.append(0.0, np.cumsum((run.signals @ robot.inverse_kinematic_matrix[2]) * np.diff(edges)))
+        of_reference = ((stamps, run.poses[:, 2]) for stamps in (run.pose_times, clock.corrected(run.pose_times)))
+        wheels, before, after = (
+            (np.interp(moments + _SMOOTH / 2, *turned) - np.interp(moments - _SMOOTH / 2, *turned)) / _SMOOTH
+            for turned in ((edges, turns), *of_reference)
         )
-    )
-    # The part in which matching brings the two together most
-    length = min(round(3 * _SHOWN / _SMOOTH), len(moments))
-    gained = np.convolve((before - wheels) ** 2 - (after - wheels) ** 2, np.ones(length), "valid")
-    part = slice(begin := int(gained.argmax()), begin + length)
-    off = abs(clock.offset + clock.drift * moments[begin])
-    drawn = np.concatenate([each[part] for each in (wheels, before, after)])
-    margin = 0.05 * float(np.ptp(drawn))
+        length = min(round(3 * _SHOWN / _SMOOTH), len(moments))
+        gained = np.convolve((before - wheels) ** 2 - (after - wheels) ** 2, np.ones(length), "valid")
+        begin = int(gained.argmax())
+        rates = np.array([moments, wheels, before, after])[:, begin : begin + length]
+        views.append((float(gained[begin]), run.id, abs(clock.offset + clock.drift * moments[begin]), rates))
+    _, name, apart, (moments, wheels, before, after) = max(views, key=lambda view: view[0])
+    low, high = (float(edge([wheels, before, after])) for edge in (np.min, np.max))
     figures = []
-    for title, reference in ((f"As recorded: {fixed(off, 2)} s apart", before), ("With matched stamps", after)):
+    for title, reference in ((f"As recorded: {fixed(apart, 2)} s apart", before), ("With matched stamps", after)):
         both = ((_WHEELS, wheels), (_REFERENCE, reference))
-        traces = [line(item, 1.8, moments[part], rates[part], hover="%{y:.2f} rad/s") for item, rates in both]
+        traces = [line(item, 1.8, moments, rates, hover="%{y:.2f} rad/s") for item, rates in both]
         figure = plot(*traces, x_title="time by the wheels' clock (s)", y_title="rate of turn (rad/s)")
-        figure.update_yaxes(range=[float(drawn.min()) - margin, float(drawn.max()) + margin])
+        figure.update_yaxes(range=[low - 0.05 * (high - low), high + 0.05 * (high - low)])
         figures.append(page.Figure(title, figure, "Rate of turn over time, by the wheels and by the reference", 300))
-    caption = f"Rate of turn in run {run.id}, whose stamps differ most."
+    caption = f"Rate of turn in run {name}, whose stamps are among those that differ most."
     return page.FigureGrid(tuple(figures), (_WHEELS, _REFERENCE), caption=caption, name="clocks")
