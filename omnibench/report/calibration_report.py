@@ -12,10 +12,10 @@ import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 
-from omnibench.data.dataset import Dataset
+from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.fit.calibrate import CalibrationRun
-from omnibench.fit.evaluate import Evaluation, SplitErrors, final_errors, positions_and_headings
+from omnibench.fit.evaluate import Evaluation, ModelErrors, SplitErrors
 from omnibench.fit.path_errors import PathError, predicted_errors
 from omnibench.report import blocks as page
 from omnibench.report.figures import drawn
@@ -26,7 +26,7 @@ from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import plot, text
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration, left_out
-from omnibench.robot.kinematics import Array, relative_deviations
+from omnibench.robot.kinematics import relative_deviations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
@@ -37,6 +37,7 @@ _SCREEN = 12  # rows of parameters and elements, of which a terminal of 25 lines
 _TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
 _FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
 _MODELS: tuple[Literal["design", "calibration"], ...] = ("design", "calibration")
+_UNITS = {"position": "mm", "heading": "deg"}
 _NOT_JUDGED = HeldOutVerdict(verdict="unknown", sentence="not judged by other runs", detail="")
 
 
@@ -133,7 +134,8 @@ class CalibrationResult(Result):
             interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
             values = (f"{row[name]:+.7f}" for name in ("design", "value"))
             change = "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"
-            rows.append((f"{row['row']}: {row['signal']}", *values, row["unit"], change, interval))
+            name = f"{'w' if row['row'] == 'heading' else row['row']}: {row['signal']}"
+            rows.append((name, *values, row["unit"], change, interval))
         return _values_table(heading or self.heading, rows, self._kept)
 
     @property
@@ -346,19 +348,20 @@ def calibration_document(
     runs, which = (judged, "held-out") if judged else (list(dataset.trajectories), "recorded")
     shown = CalibrationResult(found)
     calibration, models = shown.calibration, _models(shown.calibration, dataset)
-    errors = [final_errors(model, runs) for _, model in models]
-    by_motion = [_error_cells(errors, indices) for indices in ([*range(len(runs))], *kinds_of(runs).values())]
-    (_, *means), names = by_motion[0], ("all", *kinds_of(runs))
+    errors = [ModelErrors.of(model, runs) for _, model in models]
+    groups = {"all": runs} | {kind: [runs[index] for index in like] for kind, like in kinds_of(runs).items()}
+    rows = tuple(page.Row.of(name, *_error_cells(errors, group)) for name, group in groups.items())
+    _, _, *means = (cell.text for cell in rows[0].cells)
     tiles = [
-        page.Fact(what, f"{before} → {after}", "mean error of the final pose")
-        for what, before, after in (("Position", *means[:2]), ("Heading", *means[2:]))
+        page.Fact(what, f"{before} → {after}{unit}", "mean error of the final pose")
+        for what, before, after, unit in (("Position", *means[:2], " mm"), ("Heading", *means[2:], "°"))
+        if NOTHING not in (before, after)
     ]
     if verdict.improvement is not None:
         known = verdict.low is not None and verdict.high is not None
         interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
         tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
-    rows = tuple(page.Row.of(name, *cells) for name, cells in zip(names, by_motion, strict=True))
-    headings = (f"{what}, {model}" for what in ("position", "heading") for model in _MODELS)
+    headings = (f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS)
     of_motions = page.Table(
         f"Mean errors of the final pose of the {which} runs", page.columns("motion", "runs", *headings), rows
     )
@@ -369,18 +372,19 @@ def calibration_document(
         expected = (path_table(predicted, calibration),)
         sections.append(page.Section("paths", "What to expect on other paths", expected))
     origin = calibration.provenance
-    facts = [page.Fact("Verdict", typeset(verdict.sentence), typeset(verdict.detail))]
-    if calibration.effects:
-        facts.append(page.Fact("Effects", calibration.effects_in_words))
+    made = [("Verdict", typeset(verdict.sentence), typeset(verdict.detail))]
+    made += [("Effects", calibration.effects_in_words, "")] if calibration.effects else []
     if calibration.noise is not None:
-        facts.append(page.Fact("Noise of the reference", "; ".join(noise_in_words(calibration.noise))))
+        made.append(("Noise of the reference", "; ".join(noise_in_words(calibration.noise)), ""))
     if origin is not None:
-        options = ", ".join(f"{name} {value}" for name, value in origin.options.items())
-        facts += [
-            page.Fact("Fitted to", origin.dataset, f"hash {origin.dataset_hash}"),
-            page.Fact("Calibrator", origin.calibrator, options),
-            page.Fact("Outcome", origin.outcome, typeset(origin.reason)),
-            page.Fact("Versions", ", ".join(f"{name} {version}" for name, version in origin.versions.items())),
+        options, versions = (
+            ", ".join(f"{name} {value}" for name, value in each.items()) for each in (origin.options, origin.versions)
+        )
+        made += [
+            ("Fitted to", origin.dataset, f"hash {origin.dataset_hash}"),
+            ("Calibrator", origin.calibrator, options),
+            ("Outcome", origin.outcome, typeset(origin.reason)),
+            ("Versions", versions, ""),
         ]
     return page.Document(
         title=f"Calibration of {dataset.robot.name}",
@@ -394,17 +398,18 @@ def calibration_document(
             ),
             *sections,
             page.Section("matrix", "The matrix", (shown.deviations(), shown.elements("element"))),
-            page.Section("origin", "How it was made", (page.Facts(tuple(facts)),)),
+            page.Section("origin", "How it was made", (page.Facts(tuple(page.Fact(*each) for each in made)),)),
         ),
         badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def _error_cells(errors: Sequence[Array], indices: Sequence[int]) -> list[str]:
-    """Number of runs, and the means of their final errors (n, 3) by each model: positions, then headings."""
-    both = [positions_and_headings(of_model[indices]) for of_model in errors]
-    places = (f"{significant(1e3 * float(each.mean()))} mm" for each, _ in both)
-    return [str(len(indices)), *places, *(f"{fixed(math.degrees(float(each.mean())), 2)}°" for _, each in both)]
+def _error_cells(errors: Sequence[ModelErrors], runs: Sequence[Trajectory]) -> list[str]:
+    """Number of runs, and the means of their final errors by each model: positions, mm, then headings, degrees."""
+    both = [of_model.on(runs) for of_model in errors]
+    places = (significant(None if each.position_mean_m is None else 1e3 * each.position_mean_m) for each in both)
+    turns = (None if each.heading_mean_rad is None else math.degrees(each.heading_mean_rad) for each in both)
+    return [str(len(runs)), *places, *(fixed(turn, 2) for turn in turns)]
 
 
 def parameter_table(calibration: Calibration, title: str = "parameter") -> page.Table:
@@ -489,7 +494,7 @@ def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Ta
         rows.append(page.Row.of(path, *places, *turns))
     columns = page.columns(
         "path",
-        *(f"{what}, {model} ({unit})" for what, unit in (("position", "mm"), ("heading", "deg")) for model in _MODELS),
+        *(f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS),
     )
     runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
     return page.Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows))

@@ -29,7 +29,6 @@ from omnibench.report.recording.recording_figures import (
     all_runs,
     representative_runs,
     scan_points,
-    thinned,
     wheel_rates,
 )
 from omnibench.report.recording.section import has_recording, player, recording_document, recording_section
@@ -48,7 +47,7 @@ def made() -> Sample:
 
 @pytest.fixture(scope="module")
 def report(made: Sample, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    known = {"truth": made.truth, "plan": made.plan, "starts": made.starts, "notes": ("Made for a test.",)}
+    known = {"truth": made.truth, "plan": made.plan, "starts": made.starts}
     return page(made.dataset, tmp_path_factory.mktemp("recording"), **known)
 
 
@@ -99,8 +98,7 @@ def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
     assert all(run["scans"] == [] and run["targets"] is None for run in played(told).values())
 
 
-def test_notes_and_warnings_are_told(made: Sample, report: Page, tmp_path: Path) -> None:
-    assert "Made for a test." in report.text
+def test_warnings_are_told(made: Sample, tmp_path: Path) -> None:
     told = page(replace(made.dataset, warnings=("something odd",), simulated=False), tmp_path).text
     assert "something odd" in told
     assert "SIMULATED" not in told
@@ -157,10 +155,10 @@ def test_rates_of_the_player_are_the_mean_over_the_100_ms_before(made: Sample, r
 def test_errors_against_the_truth_are_those_of_the_accuracy(made: Sample, report: Page) -> None:
     accuracy = slam_accuracy(made.dataset, made.truth)
     caption = "Errors of the reference poses against the truth"
-    told = report.row(caption, "all poses")
-    assert float(told[1]) == pytest.approx(1e3 * accuracy.every.position_mean_m, rel=0.05)
-    assert float(told[4]) == pytest.approx(math.degrees(accuracy.every.heading_mean_rad), rel=0.05)
-    assert 2 < float(told[7]) < 4
+    told = {row[0]: row[2] for row in report.tables[caption]}
+    assert float(told["position mean (mm)"]) == pytest.approx(1e3 * accuracy.every.position_mean_m, rel=0.05)
+    assert float(told["heading mean (°)"]) == pytest.approx(math.degrees(accuracy.every.heading_mean_rad), rel=0.05)
+    assert 2 < float(told["nees mean"]) < 4
 
 
 def test_a_recording_without_truth_has_no_errors(made: Sample, tmp_path: Path) -> None:
@@ -198,10 +196,9 @@ def test_long_runs_with_many_scans_stay_below_two_megabytes(tmp_path: Path) -> N
 def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Sample) -> None:
     assert has_recording(made.dataset)
     assert not has_recording(bare(made.dataset))
-    section = recording_section(made.dataset)
-    assert section.key == "recording"
-    parts = ("paths", "player", "wheels")
-    assert [part.key for part in section.sections] == [f"recording-{part}" for part in parts]
+    pictures, contents = recording_section(made.dataset).blocks
+    assert len(pictures.figures) == 2
+    assert contents.caption == CONTENTS
 
 
 def hostile(run: Trajectory) -> Trajectory:
@@ -260,9 +257,9 @@ def test_singular_covariances_of_a_foreign_recording_are_left_out_of_the_nees(ma
     none = [replace(run, pose_covariances=np.zeros((len(run.poses), 3, 3))) for run in made.dataset.trajectories]
     caption = "Errors of the reference poses against the truth"
     told = page(replace(made.dataset, trajectories=tuple(none)), tmp_path, truth=made.truth)
-    assert told.row(caption, "all poses")[7] == "–"
+    assert told.row(caption, "nees mean")[2] == "–"
     some = replace(made.dataset, trajectories=(none[0], *made.dataset.trajectories[1:]))
-    assert 2 < float(page(some, tmp_path, truth=made.truth).row(caption, "all poses")[7]) < 4
+    assert 2 < float(page(some, tmp_path, truth=made.truth).row(caption, "nees mean")[2]) < 4
 
 
 @pytest.mark.slow
@@ -337,13 +334,6 @@ def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
     ranges = found.ranges.copy()
     ranges[0, ::2] = np.inf
     assert len(scan_points(run, scans.scanner, TrajectoryScans(found.times, ranges), 0)) == 45
-
-
-def test_thinning_keeps_points_far_apart_and_below_the_limit() -> None:
-    points = np.random.default_rng(1).uniform(0, 1, (5000, 2))
-    kept = thinned(points, 300)
-    assert 150 < len(kept) <= 300
-    assert {tuple(point) for point in kept} <= {tuple(point) for point in points}
 
 
 def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
@@ -468,7 +458,9 @@ def test_time_at_rest_is_no_motion() -> None:
 
 def inspected(dataset: Dataset, folder: Path) -> Path:
     """The file of the report of an inspection."""
-    write_document(inspection_report.inspection_document(dataset, inspect_dataset(dataset)), folder / "report.html")
+    write_document(
+        inspection_report.InspectionResult(inspect_dataset(dataset), dataset).document(), folder / "report.html"
+    )
     return folder / "report.html"
 
 

@@ -22,7 +22,7 @@ from omnibench.report import blocks as page
 from omnibench.report.figures import line, marks
 from omnibench.report.numbers import NOTHING, fixed, percent, significant, typeset, with_unit
 from omnibench.report.recording.recording_figures import evenly
-from omnibench.report.recording.section import contents_table, path_overview, pictures, tiles
+from omnibench.report.recording.section import contents_table, field_table, path_overview, pictures, tiles
 from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import PALETTE, REFERENCE, plot
 from omnibench.robot.kinematics import Array, Robot
@@ -47,7 +47,7 @@ class InspectionResult(Result):
         return NextStep(told, "calibrate it", command)
 
     def tables(self) -> Sequence[page.Table]:
-        tables = [split_table(self.inspection), identifiability_table(self.inspection)]
+        tables = [self._splits, identifiability_table(self.inspection)]
         if self.dataset is not None:
             contents = contents_table(self.dataset)
             recorded = tuple(row for row in contents.rows if row.role != "muted")
@@ -63,8 +63,44 @@ class InspectionResult(Result):
         return [Remark(text) for text in (*lines, *(f"- {each}" for each in found.findings))]
 
     def document(self) -> page.Document:
-        assert self.dataset is not None
-        return inspection_document(self.dataset, self.inspection)
+        """DataError in one line: scans that cannot be read."""
+        dataset, inspection = self.dataset, self.inspection
+        assert dataset is not None
+        training = dataset.split("train") or dataset.trajectories
+        identified, motions = inspection.identifiability, motion_table(training, dataset.robot)
+        missing = ", ".join(row.cells[0].text for row in motions.rows if row.role == "failed")
+        lacks = f"Not driven to train: {missing}." if missing else "Every kind of motion was driven to train."
+        told = "Part of the matrix stays open." if identified.sentences else "The runs determine all of the matrix."
+        picture, speeds = path_overview(dataset), speed_figure(training, dataset.robot)
+        if alone := len(picture.figures) == 1:  # beside the paths there is room for the speeds
+            picture = replace(picture, figures=(*picture.figures, speeds))
+        driven = (motions,) if alone else (page.FigureGrid((speeds,)), motions)
+        answer = page.answer_section(
+            f"{plural(inspection.trajectories, 'run')} of {inspection.robot}. {lacks} {told}",
+            tiles(dataset, sum(split.distance_m for split in inspection.splits.values())),
+            picture,
+            page.Callout("Findings", inspection.findings, "warning" if identified.sentences else "plain"),
+            page.Callout("Warnings on reading the data", inspection.warnings, "warning"),
+        )
+        known: list[page.Block] = [parameter_table(inspection)] if identified.parameters else []
+        known += [identifiability_table(inspection), page.Paragraph(f"Noise: {identified.noise_source}.", "note")]
+        return page.Document(
+            title=f"Inspection of {dataset.name}",
+            subtitle=dataset.description,
+            sections=(
+                answer,
+                page.Section("motions", "Motions driven", driven),
+                page.Section("identified", "What can be identified", tuple(known)),
+                *pictures(dataset),
+                page.Section("recorded", "What was recorded", (self._splits, contents_table(dataset))),
+            ),
+            badges=page.simulated_badge(dataset.simulated),
+        )
+
+    @property
+    def _splits(self) -> page.Table:
+        """The content of each split: runs, commands, repetitions, sessions, time, distance, turns."""
+        return field_table("", {name: dict(split) for name, split in self.inspection.splits.items()})
 
     def json(self) -> Inspection:
         return self.inspection
@@ -100,7 +136,35 @@ class CheckResult(Result):
         return [*lines, *([Remark(f"{needed[checked.needed]}{checked.gain}")] if checked.gain else [])]
 
     def document(self) -> page.Document:
-        return check_document(self.dataset, self.checked)
+        dataset, checked = self.dataset, self.checked
+        runs = [run for run in dataset.trajectories if run.has_poses]
+        clocks_are_off = any(finding.kind in CLOCKS for finding in checked.findings)
+        picture = _clock_picture(dataset.robot, runs, checked.clocks) if clocks_are_off else None
+        facts = [
+            page.Fact(f"{severity.capitalize()}s", str(sum(each.severity == severity for each in checked.findings)))
+            for severity in ("error", "warning", "note")
+        ]
+        columns = tuple(page.Column(name, numeric=False) for name in ("", "finding", "where", "what to type or do"))
+        rows = tuple(
+            page.Row.of(
+                each.severity, each.what, each.where, f"--set {each.fix}" if each.changes and each.fix else each.fix
+            )
+            for each in checked.findings
+        )
+        gain = (
+            f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
+        )
+        answer = page.answer_section(
+            f"{checked.sentence}.",
+            [*facts, page.Fact("Runs", str(len(dataset.trajectories)))],
+            picture or path_overview(dataset),
+            *([page.Table("Findings, each with what to type", columns, rows)] if rows else []),
+            *([page.Code(checked.command, "One import mends what options mend")] if checked.command else []),
+            *([page.Paragraph(gain, "note")] if checked.gain else []),
+            title="Verdict",
+        )
+        badges = page.simulated_badge(dataset.simulated)
+        return page.Document(f"Check: {dataset.name}", dataset.description, (answer,), badges)
 
     def json(self) -> dict[str, Any]:
         return self.checked.model_dump(mode="json", include={"verdict", "needed", "findings", "command"})
@@ -114,21 +178,6 @@ _TONES: dict[str, page.Tone] = {
 def driven_by(inspection: Inspection) -> str:
     """What the columns of the matrix are: wheel rates, or drive signals."""
     return "wheel rates" if len(inspection.driven_shares) == len(inspection.wheels) else "drive signals"
-
-
-def split_table(inspection: Inspection) -> page.Table:
-    """The content of each split: runs, commands, repetitions, sessions, time, distance, turns."""
-    rows = []
-    for name, split in inspection.splits.items():
-        repetitions = " to ".join(map(str, sorted({split.repetitions_min, split.repetitions_max})))
-        numbers = map(str, (split.trajectories, split.commands, repetitions, split.sessions))
-        turned = math.degrees(split.turned_rad)
-        rows.append(page.Row.of(name, *numbers, f"{split.duration_s:.0f}", f"{split.distance_m:.1f}", f"{turned:.0f}"))
-    repeated = page.Column("repetitions", priority=1)
-    columns = page.columns(
-        "split", "runs", "commands", repeated, "sessions", "duration (s)", "distance (m)", "turned (°)"
-    )
-    return page.Table("", columns, tuple(rows))
 
 
 def identifiability_table(inspection: Inspection) -> page.Table:
@@ -164,9 +213,9 @@ def parameter_table(inspection: Inspection) -> page.Table:
 
 
 _BLOCK = 0.5  # s: motions are means over so long, which smooths encoder ticks (chosen)
-_RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
 _DRAWN = 2500  # dots of a figure
 _MOTION = page.LegendItem("motion", "half a second of motion", PALETTE[0])
+_RESTS = 0.05  # share of the fastest motion below which the robot stands (chosen)
 
 
 def driven_twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Array]:
@@ -175,14 +224,24 @@ def driven_twists(runs: Sequence[Trajectory], robot: Robot) -> tuple[Array, Arra
     for run in runs:
         steps = np.diff(run.times, prepend=0.0)
         starts = np.flatnonzero(np.diff(run.times // _BLOCK, prepend=-1.0))
-        lengths = np.add.reduceat(steps, starts)
         moved = np.add.reduceat(run.signals @ robot.inverse_kinematic_matrix.T * steps[:, None], starts)
-        means.append(moved / lengths[:, None])
-        durations.append(lengths)
+        durations.append(np.add.reduceat(steps, starts))
+        means.append(moved / durations[-1][:, None])
     twists, seconds = np.concatenate(means), np.concatenate(durations)
     size = np.hypot(twists[:, 0], twists[:, 1]) + robot.reach * np.abs(twists[:, 2])
     moving = size > _RESTS * float(size.max(initial=0.0))
     return twists[moving], seconds[moving]
+
+
+def speed_figure(runs: Sequence[Trajectory], robot: Robot) -> page.Figure:
+    """Speeds against rates of turn, a dot for every half second."""
+    twists, _ = driven_twists(runs, robot)
+    vx, vy, rates = twists[evenly(len(twists), _DRAWN)].T if len(twists) else twists.T
+    dots = marks(_MOTION, 5, np.degrees(rates), np.hypot(vx, vy), hover="%{x:.0f}°/s, %{y:.2f} m/s", marker_opacity=0.6)
+    figure = plot(dots, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
+    figure.update_xaxes(autorange="reversed").update_yaxes(rangemode="tozero")
+    title = "Speeds and rates of turn, a dot for every half second"
+    return page.Figure(title, figure, "Speed in m/s against the rate of turn in °/s", 340)
 
 
 def motion_table(runs: Sequence[Trajectory], robot: Robot) -> page.Table:
@@ -207,84 +266,11 @@ def _range(values: Array, decimals: int) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def inspection_document(dataset: Dataset, inspection: Inspection) -> page.Document:
-    """The report as blocks. DataError in one line: scans that cannot be read."""
-    training = dataset.split("train") or dataset.trajectories
-    identified, motions = inspection.identifiability, motion_table(training, dataset.robot)
-    missing = ", ".join(row.cells[0].text for row in motions.rows if row.role == "failed")
-    lacks = f"Not driven to train: {missing}." if missing else "Every kind of motion was driven to train."
-    told = "Part of the matrix stays open." if identified.sentences else "The runs determine all of the matrix."
-    twists, _ = driven_twists(training, dataset.robot)
-    vx, vy, rates = twists[evenly(len(twists), _DRAWN)].T if len(twists) else twists.T
-    hover = "%{x:.0f}°/s, %{y:.2f} m/s"
-    dots = marks(_MOTION, 5, np.degrees(rates), np.hypot(vx, vy), hover=hover, marker_opacity=0.6)
-    speeds = plot(dots, x_title="rate of turn, to the left (°/s)", y_title="speed (m/s)")
-    speeds.update_xaxes(autorange="reversed").update_yaxes(rangemode="tozero")
-    title = "Speeds and rates of turn, a dot for every half second"
-    figure = page.Figure(title, speeds, "Speed in m/s against the rate of turn in °/s", 340)
-    picture, driven = path_overview(dataset), list[page.Block]()
-    if len(picture.figures) == 1:  # beside the paths there is room for the speeds
-        picture = replace(picture, figures=(*picture.figures, figure))
-    else:
-        driven = [page.FigureGrid((figure,))]
-    answer = page.answer_section(
-        f"{plural(inspection.trajectories, 'run')} of {inspection.robot}. {lacks} {told}",
-        tiles(dataset, sum(split.distance_m for split in inspection.splits.values())),
-        picture,
-        page.Callout("Findings", inspection.findings, "warning" if identified.sentences else "plain"),
-        page.Callout("Warnings on reading the data", inspection.warnings, "warning"),
-    )
-    known: list[page.Block] = [parameter_table(inspection)] if identified.parameters else []
-    known += [identifiability_table(inspection), page.Paragraph(f"Noise: {identified.noise_source}.", "note")]
-    return page.Document(
-        title=f"Inspection of {dataset.name}",
-        subtitle=dataset.description,
-        sections=(
-            answer,
-            page.Section("motions", "Motions driven", (*driven, motions)),
-            page.Section("identified", "What can be identified", tuple(known)),
-            *pictures(dataset),
-            page.Section("recorded", "What was recorded", (split_table(inspection), contents_table(dataset))),
-        ),
-        badges=page.simulated_badge(dataset.simulated),
-    )
-
-
 _WHEELS = page.LegendItem("wheels", "by the wheels, at the design", PALETTE[0])
 _REFERENCE = page.LegendItem("reference", "by the reference", REFERENCE)
 _SMOOTH = 0.3  # s over which rates of turn are taken, so that the reference's noise does not hide them; chosen
 _SHOWN = 12.0  # s that are drawn, where matching shows best; chosen
 _LOOKED_AT = 8  # runs whose clocks are farthest off, of which the one is drawn that shows it best; chosen
-
-
-def check_document(dataset: Dataset, checked: CheckReport) -> page.Document:
-    """The report on a data set as blocks."""
-    runs = [run for run in dataset.trajectories if run.has_poses]
-    clocks_are_off = any(finding.kind in CLOCKS for finding in checked.findings)
-    picture = _clock_picture(dataset.robot, runs, checked.clocks) if clocks_are_off else None
-    facts = [
-        page.Fact(f"{severity.capitalize()}s", str(sum(each.severity == severity for each in checked.findings)))
-        for severity in ("error", "warning", "note")
-    ]
-    columns = tuple(page.Column(name, numeric=False) for name in ("", "finding", "where", "what to type or do"))
-    rows = tuple(
-        page.Row.of(
-            each.severity, each.what, each.where, f"--set {each.fix}" if each.changes and each.fix else each.fix
-        )
-        for each in checked.findings
-    )
-    gain = f"What a calibration would gain on runs that it was not fitted to, each in turn; {typeset(checked.gain)}."
-    answer = page.answer_section(
-        f"{checked.sentence}.",
-        [*facts, page.Fact("Runs", str(len(dataset.trajectories)))],
-        picture or path_overview(dataset),
-        *([page.Table("Findings, each with what to type", columns, rows)] if rows else []),
-        *([page.Code(checked.command, "One import mends what options mend")] if checked.command else []),
-        *([page.Paragraph(gain, "note")] if checked.gain else []),
-        title="Verdict",
-    )
-    badges = page.simulated_badge(dataset.simulated)
-    return page.Document(f"Check: {dataset.name}", dataset.description, (answer,), badges)
 
 
 def _clock_picture(

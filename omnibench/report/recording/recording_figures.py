@@ -114,16 +114,6 @@ def evenly(count: int, limit: int) -> Array:
     return picks
 
 
-def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
-    """At most ``limit`` of the points (n, 2): one for each occupied cell of a grid (``cell`` m), widened as needed."""
-    while True:
-        _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
-        if len(first) <= limit:
-            kept: Array = points[np.sort(first)]
-            return kept
-        cell *= 1.25
-
-
 # How much one figure draws (chosen: more cannot be told apart on a screen).
 _POINTS = 2500  # scan points
 _SCANS = 120  # scans of a run
@@ -154,21 +144,15 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     items = [item]
     if dataset.scans is not None:
         room = [line(PLAN_ITEM, 1.5, *joined(outlines).T)] if outlines else []
-        points = seen_from(shown.start, thinned(run_points(dataset, shown), _POINTS))
+        scanner, scans = dataset.scans.scanner, dataset.scans.of(shown.id)
+        picks = evenly(len(scans.times), _SCANS)
+        points = np.vstack([scan_points(shown, scanner, scans, int(scan)) for scan in picks])
+        points = seen_from(shown.start, points[evenly(len(points), _POINTS)])
         room.append(marks(SCANS_ITEM, 2.5, *points.T, opacity=0.6))
         title = f"The room that {shown.id} saw"
         figures.append(Figure(title, _map([*room, *paths]), f"{title}, by its scans, with the paths of all runs", 340))
         items += [SCANS_ITEM, *([PLAN_ITEM] if outlines else [])]
     return FigureGrid(tuple(figures), tuple(items), 2, words, "paths")
-
-
-def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
-    """Scan points (n, 2) of a run, m, in the frame of its reference poses, from at most 120 scans."""
-    if dataset.scans is None:
-        return np.empty((0, 2))
-    scanner, scans = dataset.scans.scanner, dataset.scans.of(trajectory.id)
-    picks = evenly(len(scans.times), _SCANS)
-    return np.vstack([scan_points(trajectory, scanner, scans, int(scan)) for scan in picks])
 
 
 def _map(traces: Sequence[go.Scatter]) -> go.Figure:

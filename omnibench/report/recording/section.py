@@ -26,15 +26,7 @@ from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import plot
 from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
-from omnibench.slam.slam_dataset import (
-    Distances,
-    ErrorSummary,
-    SlamAccuracy,
-    SlamResult,
-    SlamSummary,
-    run_errors,
-    slam_accuracy,
-)
+from omnibench.slam.slam_dataset import SlamAccuracy, SlamResult, SlamSummary, run_errors, slam_accuracy
 from omnibench.words import kind_of_data, plural
 
 _FRAMES = 200  # frames drawn of a run (chosen: steps of the slider that can be told apart)
@@ -140,20 +132,15 @@ class ReferencePosesResult(Result):
 
     def tables(self) -> Sequence[blocks.Table]:
         summary = self.result.summary
-        stated, known = blocks.Cell("deviation stated at the end of a run"), summary.recorded
-        lengths, angles = (
-            (getattr(summary, f"{what}_deviation_mean_{unit}"), None, getattr(summary, f"{what}_deviation_max_{unit}"))
-            for what, unit in (("position", "m"), ("heading", "rad"))
-        )
-        rows = [_error_row(stated, lengths, angles)]
-        if known is not None:
-            name = blocks.Cell("distance from the recorded reference", plural(known.poses, "pose"))
-            rows.append(_error_row(name, *_errors_of(known)))
+        stated = {name.replace("_deviation", ""): each for name, each in summary if "_deviation_" in name}
+        columns = {"stated deviation at a run's end": stated}
+        if summary.recorded is not None:
+            columns["distance from the recorded reference"] = summary.recorded.model_dump()
         note = f"{plural(summary.runs, 'run')}, {plural(summary.scans, 'scan')}; {summary.matched_mean:.1%} of the "
         note += f"points matched (worst scan {summary.matched_min:.0%})"
         title = f"{summary.dataset}, {kind_of_data(summary.simulated)}: reference poses from the scans"
-        first = blocks.Table(title, blocks.columns("Poses", *_ERROR_COLUMNS), tuple(rows), note)
-        return [first, *([error_table(summary.accuracy)] if summary.accuracy is not None else [])]
+        errors = [] if summary.accuracy is None else [error_table(summary.accuracy)]
+        return [field_table(title, columns, note), *errors]
 
     def remarks(self) -> Sequence[Remark]:
         written = {"report": self.report, plural(self.result.summary.runs, "trajectory"): self.poses}
@@ -174,42 +161,29 @@ class ReferencePosesResult(Result):
         return self.result.summary
 
 
-_Errors = tuple[float | None, float | None, float | None]  # mean, 95th percentile and worst
-_ERROR_COLUMNS = tuple(
-    blocks.Column(f"{what}, {which}", unit, priority=int(which == "95 %"))
-    for what, unit in (("position", "mm"), ("heading", "°"))
-    for which in ("mean", "95 %", "worst")
-)
-
-
-def _errors_of(errors: Distances | ErrorSummary) -> tuple[_Errors, _Errors]:
-    """Position errors, m, and heading errors, rad."""
-    lengths = (errors.position_mean_m, errors.position_p95_m, getattr(errors, "position_max_m", None))
-    return lengths, (errors.heading_mean_rad, errors.heading_p95_rad, getattr(errors, "heading_max_rad", None))
-
-
-def _error_row(name: blocks.Cell, lengths: _Errors, angles: _Errors, *more: str) -> blocks.Row:
-    shown = [NOTHING if value is None else _mm(value) for value in lengths]
-    return blocks.Row.of(name, *shown, *(NOTHING if value is None else _degrees(value) for value in angles), *more)
+def field_table(caption: str, columns: Mapping[str, Mapping[str, float | None]], note: str = "") -> blocks.Table:
+    """Numbers by the names of their fields, whose endings give the unit: a row a field, a column each."""
+    rows = []
+    for name in dict.fromkeys(name for numbers in columns.values() for name in numbers):
+        values = [numbers.get(name) for numbers in columns.values()]
+        words, _, ending = name.rpartition("_")
+        small = all(abs(value) < 1 for value in values if value is not None)
+        units = {"m": (1e3, "mm") if small else (1.0, "m"), "rad": (math.degrees(1.0), "°"), "s": (1.0, "s")}
+        factor, unit = units.get(ending, (1.0, ""))
+        heading = f"{words} ({unit})" if unit else name
+        scaled = (value if value is None or isinstance(value, int) else factor * value for value in values)
+        shown = (count(each) if isinstance(each, int) else significant(each) for each in scaled)
+        rows.append(blocks.Row.of(heading.replace("_", " "), *shown))
+    return blocks.Table(caption, blocks.columns("", *columns), tuple(rows), note)
 
 
 def error_table(accuracy: SlamAccuracy) -> blocks.Table:
     """The errors of reference poses against the truth: of the last pose of each run, and of all poses."""
-    rows = []
-    for name, errors in (("last poses", accuracy.final), ("all poses", accuracy.every)):
-        forward, left = (significant(1e3 * bias, 2, True) for bias in (errors.bias_forward_m, errors.bias_left_m))
-        turned = significant(math.degrees(errors.bias_heading_rad), 2, True)
-        nees = NOTHING if errors.nees_mean is None else significant(errors.nees_mean, 2)
-        rows.append(_error_row(blocks.Cell(name), *_errors_of(errors), nees, forward, left, turned))
-    signed = (("forward", "mm"), ("to the left", "mm"), ("heading, signed", "°"))
-    return blocks.Table(
-        "Errors of the reference poses against the truth",
-        blocks.columns("Poses", *_ERROR_COLUMNS, "NEES", *(blocks.Column(*each, priority=2) for each in signed)),
-        tuple(rows),
-        f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all; drift "
-        f"{_mm(accuracy.drift_position)} mm and {_degrees(accuracy.drift_heading)}° per metre. NEES: squared error "
-        "over the stated covariance, 3 where that is right.",
-    )
+    note = f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all; drift "
+    note += f"{_mm(accuracy.drift_position)} mm and {_degrees(accuracy.drift_heading)}° per metre. NEES: squared error "
+    note += "over the stated covariance, 3 where that is right. p95: 95 % are smaller."
+    both = {"last poses": accuracy.final.model_dump(), "all poses": accuracy.every.model_dump()}
+    return field_table("Errors of the reference poses against the truth", both, note)
 
 
 def _mm(metres: float) -> str:
@@ -339,13 +313,12 @@ def recording_document(
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
-    notes: Sequence[str] = (),
 ) -> blocks.Document:
     """The report on a recording as blocks: its contents, the room, the wheels, a run step by step.
 
     For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
     starts: true start pose (3,) of each run in that room, m, m, rad (default: the plan's start). accuracy: errors of
-    the reference poses (default: computed from the truth). notes: remarks at the top of the report.
+    the reference poses (default: computed from the truth).
 
     DataError in one line: broken scans, or a truth of other runs.
     """
@@ -371,7 +344,6 @@ def recording_document(
         f"{plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}, {facts[1].value} {facts[1].note}.",
         facts,
         path_overview(dataset, plan, starts),
-        blocks.Callout("Before you rely on it", tuple(notes)),
         blocks.Callout("Warnings on reading the data", dataset.warnings, "warning"),
     )
     return blocks.Document(
@@ -380,7 +352,7 @@ def recording_document(
         (
             answer,
             *compared,
-            *pictures(dataset, truth=known, plan=plan, starts=starts),
+            *pictures(dataset, known, plan, starts),
             blocks.Section("recorded", "What was recorded", (contents_table(dataset),)),
         ),
         blocks.simulated_badge(dataset.simulated),
@@ -402,15 +374,11 @@ def has_recording(dataset: Dataset) -> bool:
 
 def recording_section(dataset: Dataset) -> blocks.Section:
     """The section on a recording for another report. DataError in one line: broken scans."""
-    paths = blocks.Section("recording-paths", "Paths of all runs", (path_overview(dataset),))
-    parts = (paths, *pictures(dataset, prefix="recording-"))
-    return blocks.Section("recording", "Recording", (contents_table(dataset),), parts, folded=True)
+    return blocks.Section("recording", "Recording", (path_overview(dataset), contents_table(dataset)), folded=True)
 
 
 def pictures(
     dataset: Dataset,
-    *,
-    prefix: str = "",
     truth: Mapping[str, TruePath] | None = None,
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
@@ -427,8 +395,8 @@ def pictures(
         played += (blocks.Paragraph(inexact, "note"),)
     rates = {name: (recording_figures.wheel_rates(run, dataset.robot),) for name, run in runs.items()}
     return [
-        blocks.Section(f"{prefix}player", "Step by step", played),
-        blocks.Section(f"{prefix}wheels", "Wheel rates", (blocks.Choice("Run", rates),)),
+        blocks.Section("player", "Step by step", played),
+        blocks.Section("wheels", "Wheel rates", (blocks.Choice("Run", rates),)),
     ]
 
 
