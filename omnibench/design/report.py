@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from omnibench.design.candidates import Per, Use
-from omnibench.design.design import Candidate, Design, Effort, Precision, SetDesign, Step
+from omnibench.design.design import Candidate, Design, Effort, Precision, SetDesign
 from omnibench.report import blocks as page
 from omnibench.report.figures import ORIGIN, line, marks
 from omnibench.report.numbers import (
@@ -90,18 +90,15 @@ class DesignResult(Result):
             if not design.recorded:
                 plans.append(page.Callout(f"What to drive of {of_set.name}", what_to_drive(design, of_set)))
             chosen += [chosen_table(design, of_set), page.Paragraph(left_open(of_set))]
-        paths, curves = path_figures(design), precision_figures(design)
+        paths, curve, precision = path_figures(design), precision_figure(design), list[page.Block]()
         if len(paths.figures) == 1:  # beside the paths there is room for what they give
-            paths = replace(paths, figures=(*paths.figures, curves.figures[0]), columns=2)
-            curves = replace(curves, figures=curves.figures[1:])
+            paths = replace(paths, figures=(*paths.figures, *curve.figures), columns=2)
+        else:
+            precision.append(curve)
         answer = page.answer_section(
             self.sentence(), tiles, paths, *plans, page.Callout("Before you rely on it", design.notes)
         )
-        precision: tuple[page.Block, ...] = (
-            curves,
-            *(effort_table(design, of_set) for of_set in design.sets),
-            equal_table(design),
-        )
+        precision += [*(effort_table(design, of_set) for of_set in design.sets), equal_table(design)]
         position, heading = noise_in_words(design.noise)
         gaps = [f"{each.name}: within {100 * each.optimum.gap:.1g} % of its bound" for each in design.sets]
         facts = {
@@ -110,7 +107,7 @@ class DesignResult(Result):
             "Noise of positions": position,
             "Noise of headings": heading,
             "Elements determined": f"{design.parameters} of the inverse kinematic matrix",
-            "Odometry": "exact arcs" if design.integration == "arc" else "Euler steps, Eq. (1)",
+            "Odometry": design.integration,
             "Calibrated from": _USES[design.use],
             "Continuous optima": listing(gaps),
         }
@@ -123,7 +120,7 @@ class DesignResult(Result):
             sections=(
                 answer,
                 page.Section("commands", "Chosen commands", tuple(chosen)),
-                page.Section("precision", "Precision and efficiency", precision, folded=True),
+                page.Section("precision", "Precision", tuple(precision), folded=True),
                 page.Section("basis", "What this rests on", basis, folded=True),
             ),
             badges=page.simulated_badge(design.simulated) if design.recorded else (_ASSUMED,),
@@ -222,56 +219,29 @@ def path_figures(design: Design) -> page.FigureGrid:
     )
 
 
-def precision_figures(design: Design) -> page.FigureGrid:
-    """Standard deviations, and efficiency, of the best runs found against their number."""
-    baseline = plural(design.baseline.precision.effort.runs, "run")
-    relative = _curves(design, lambda step: step.relative, "standard deviation / baseline's")
-    relative.add_trace(marks(_BASELINE, 10, [design.baseline.precision.effort.runs], [1.0], hover="baseline"))
-    relative.add_hline(y=1.0, line={"color": QUIET, "width": 1, "dash": "dot"})
-    heights = [step.relative for of_set in design.sets for step in of_set.steps]
-    logarithmic(relative, "y", min(1.0, *heights), max(1.0, *heights))
-    efficiency = _curves(design, lambda step: 100 * step.efficiency, "efficiency (% of the bound)")
-    lowest = min(step.efficiency for of_set in design.sets for step in of_set.steps)
-    efficiency.update_yaxes(range=[max(0.0, 100 * lowest - 3), 102])
-    efficiency.add_hline(y=100, line={"color": INK, "width": 1.2})
-    return page.FigureGrid(
-        (
-            page.Figure(
-                f"Standard deviation of all elements together, as a multiple of the baseline's ({baseline})",
-                relative,
-                "Geometric mean of the standard deviations against the number of runs, on logarithmic scales",
-            ),
-            page.Figure(
-                f"Information per {design.per} against the bound",
-                efficiency,
-                "Efficiency of the designs against the number of runs, and the bound at 100 % that none exceeds",
-            ),
-        ),
-        _legend(design),
-        2,
-        "One standard deviation of the best unbiased estimate (the Cramér-Rao bound). Ring: the chosen design; "
-        "diamond: the baseline; line at 100 %: the bound of Kiefer and Wolfowitz, which no design exceeds.",
-    )
-
-
-def _curves(design: Design, value: Callable[[Step], float], y_title: str) -> go.Figure:
-    """A line through the steps of each set over the number of runs, with a ring around the chosen one."""
-    traces = []
-    for of_set, item in zip(design.sets, _legend(design), strict=True):
+def precision_figure(design: Design) -> page.FigureGrid:
+    """Standard deviations of the best runs found against their number, with a ring around the chosen ones."""
+    baseline, traces = design.baseline.precision.effort.runs, []
+    for of_set, item in zip(design.sets, legend := _legend(design), strict=True):
         words = [
             f"{of_set.name}, {_effort(step.effort)}, {percent(step.efficiency, 2)} of the bound"
             for step in of_set.steps
         ]
-        runs = [step.effort.runs for step in of_set.steps]
-        traces.append(
-            line(item, 2.0, runs, [value(step) for step in of_set.steps], hover="%{text}<br>%{y:.4g}", words=words)
-        )
+        runs, relative = zip(*((step.effort.runs, step.relative) for step in of_set.steps), strict=True)
+        traces.append(line(item, 2.0, runs, relative, hover="%{text}<br>%{y:.4g}", words=words))
         ring: dict[str, Any] = {"marker_symbol": "circle-open", "marker_line_width": 2.5}
-        traces.append(marks(item, 11, [of_set.step.effort.runs], [value(of_set.step)], **ring))
-    figure = plot(*traces, x_title="runs", y_title=y_title)
-    everything = [design.baseline.precision.effort.runs, *(run for trace in traces for run in trace.x)]
-    logarithmic(figure, "x", min(everything), max(everything))
-    return figure
+        traces.append(marks(item, 11, [of_set.step.effort.runs], [of_set.step.relative], **ring))
+    traces.append(marks(_BASELINE, 10, [baseline], [1.0], hover="baseline"))
+    figure = plot(*traces, x_title="runs", y_title="standard deviation / baseline's")
+    figure.add_hline(y=1.0, line={"color": QUIET, "width": 1, "dash": "dot"})
+    for axis in ("x", "y"):
+        values = [value for trace in traces for value in trace[axis]]
+        logarithmic(figure, axis, min(values), max(values))
+    title = f"Standard deviation of all elements together, as a multiple of the baseline's ({plural(baseline, 'run')})"
+    about = "Geometric mean of the standard deviations against the number of runs, on logarithmic scales"
+    caption = "One standard deviation of the best unbiased estimate (the Cramér-Rao bound). Ring: the chosen design; "
+    caption += "diamond: the baseline."
+    return page.FigureGrid((page.Figure(title, figure, about),), legend, 1, caption)
 
 
 def _legend(design: Design) -> tuple[page.LegendItem, ...]:

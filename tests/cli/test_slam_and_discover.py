@@ -299,7 +299,8 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
 
 def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> None:
     run = command("inspect", driven.data)
-    assert "540 rays over 270° up to 30 m, 100% measured; in 3 runs" in run.stdout
+    assert "540 ranges over 270°, to 30 m" in run.stdout
+    assert "scans: 100% of the rays measured" in run.stdout
     document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
     scans = load_dataset(driven.data).scans
     assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)

@@ -97,7 +97,7 @@ def test_the_chosen_commands_stand_in_tables(design: Design, report: Page) -> No
 
 def test_plots_show_a_path_for_every_candidate_and_none_is_empty(design: Design, report: Page) -> None:
     drawn = plots(report)
-    assert len(drawn) == report.plots == 2 + 2
+    assert len(drawn) == report.plots == 2 + 1
     for found, flower_plot in zip(design.sets, drawn, strict=False):
         lines = [trace for trace in flower_plot["data"] if trace["mode"] == "lines"]
         assert len(lines) == len(found.commands)
@@ -120,8 +120,8 @@ def test_a_turn_on_the_spot_is_drawn_as_an_arc(tmp_path: Path) -> None:
 
 
 def test_axes_of_precision_are_logarithmic_and_their_labels_readable(report: Page) -> None:
-    relative, efficiency = (each["layout"] for each in plots(report)[2:4])
-    for axis in (relative["xaxis"], relative["yaxis"], efficiency["xaxis"]):
+    layout = plots(report)[2]["layout"]
+    for axis in (layout["xaxis"], layout["yaxis"]):
         assert axis["type"] == "log"
         assert not any("e+" in label for label in axis["ticktext"])
 
@@ -130,7 +130,7 @@ def test_four_wheels_have_a_report_without_physical_parameters(tmp_path: Path) -
     config = flower(robot=LEVER_MECANUM, truth={"tolerances": {"radius": 0.02, "seed": 1}})
     dataset = simulate_dataset(FlowerConfig.model_validate(config)).dataset
     told = page(design_experiment(candidates_of_dataset(dataset)), tmp_path)
-    assert told.plots == 2 + 1
+    assert told.plots == 2
 
 
 def test_hostile_names_stay_words(tmp_path: Path) -> None:

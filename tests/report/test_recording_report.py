@@ -170,7 +170,7 @@ def test_a_recording_without_truth_has_no_errors(made: Sample, tmp_path: Path) -
 @pytest.mark.parametrize("with_accuracy", [False, True])
 def test_the_truth_of_other_runs_is_one_line(made: Sample, tmp_path: Path, with_accuracy: bool) -> None:
     accuracy = slam_accuracy(made.dataset, made.truth) if with_accuracy else None
-    with pytest.raises(DataError, match="run straight-0 is not in the truth"):
+    with pytest.raises(DataError, match="straight-0 is not in the truth"):
         page(made.dataset, tmp_path, truth={"another": made.truth["left-0"]}, accuracy=accuracy)
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.stored import drawn_runs
 from omnibench.data.true_poses import TruePath
-from omnibench.errors import DataError
 from omnibench.report import blocks
 from omnibench.report.figures import is_placed, joined, line
 from omnibench.report.numbers import NOTHING, count, fixed, significant
@@ -318,18 +317,12 @@ def recording_document(
 
     For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
     starts: true start pose (3,) of each run in that room, m, m, rad (default: the plan's start). accuracy: errors of
-    the reference poses (default: computed from the truth).
+    the reference poses where the truth is not at hand.
 
     DataError in one line: broken scans, or a truth of other runs.
     """
     known = truth or {}
-    for run in dataset.trajectories if known else ():
-        if run.id not in known:
-            raise DataError(
-                f"data set {dataset.name}: run {run.id} is not in the truth; name the truth of this data set"
-            )
-    if known and accuracy is None:
-        accuracy = slam_accuracy(dataset, known)
+    accuracy = slam_accuracy(dataset, known) if known else accuracy
     metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in dataset.trajectories)
     facts, compared = tiles(dataset, metres), list[blocks.Section]()
     if accuracy is not None:
