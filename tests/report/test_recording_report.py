@@ -347,8 +347,7 @@ def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
 def test_the_error_is_measured_minus_target(made: Sample) -> None:
     run = made.dataset.trajectories[0]
     slow = replace(run, rates=np.asarray(run.targets) - 0.25)
-    (rates,) = wheel_rates(slow, made.dataset.robot).figures
-    assert rates.title == "Wheel rates; measured − target: mean −0.25, RMS 0.25 rad/s"
+    assert wheel_rates(slow, made.dataset.robot).caption == "Measured − target: mean −0.25, RMS 0.25 rad/s."
 
 
 def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample) -> None:

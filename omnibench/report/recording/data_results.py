@@ -16,7 +16,7 @@ from omnibench.report.figures import START, is_drawn, marks, motion_system, path
 from omnibench.report.recording.recording_figures import REFERENCE_ITEM, all_runs
 from omnibench.report.result import Remark, Result, frame_table
 from omnibench.report.style import plan
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Robot
 from omnibench.words import plural
 
 _WARNINGS = 5  # shown of a data set
@@ -101,14 +101,12 @@ class TrajectoryResult(Result):
         return ", ".join(parts)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        run, references = self.run, self.run.references
-        tables: dict[str, Callable[[], pl.DataFrame]] = {
-            "wheels": lambda: _numbered(run.times, {"omega": run.rates, "steer": run.steering}),
-            "poses": lambda: pl.DataFrame(
-                {"t": run.pose_times} | dict(zip(("x", "y", "theta"), run.poses.T, strict=True))
-            ),
-        }
-        if references is not None:
+        run, wheels = self.run, {"t": np.asarray(self.run.times)}
+        for name, values in (("omega", run.rates), ("steer", run.steering)):
+            wheels |= {f"{name}_{index + 1}": column for index, column in enumerate(() if values is None else values.T)}
+        poses = {"t": run.pose_times} | dict(zip(("x", "y", "theta"), run.poses.T, strict=True))
+        tables = {"wheels": lambda: pl.DataFrame(wheels), "poses": lambda: pl.DataFrame(poses)}
+        if (references := run.references) is not None:
             tables["references"] = lambda: reference_frame([("", references)]).drop("trajectory")
         return tables
 
@@ -117,11 +115,3 @@ class TrajectoryResult(Result):
         title = f"Reference path of {self.run.id}"
         figure = Figure(title, plan(path(REFERENCE_ITEM, self.run.poses, 2.5), start), title)
         return [FigureGrid((figure,), (REFERENCE_ITEM,), 1)]
-
-
-def _numbered(times: Array, values: Mapping[str, Array | None]) -> pl.DataFrame:
-    """Times (F,) and values (F, n) as a table, whose columns are numbered from 1."""
-    columns = {"t": np.asarray(times)}
-    for name, array in values.items():
-        columns |= {f"{name}_{index + 1}": column for index, column in enumerate(() if array is None else array.T)}
-    return pl.DataFrame(columns)

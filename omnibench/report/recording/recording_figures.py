@@ -66,8 +66,10 @@ def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
     kinds = kinds_of(runs)
     if len(kinds) < 2:
         return {describe(run): run for run in (runs[index] for index in evenly(len(runs), _SHOWN))}
-    ends = OdometryModel.of_design(dataset.robot, "arc").poses([run.final_log for run in runs])
-    errors = [math.hypot(*(end[-1, :2] - run.final_pose[:2])) for end, run in zip(ends, runs, strict=True)]
+    design = OdometryModel.of_design(dataset.robot, "arc")
+    posed = {index: runs[index] for like in kinds.values() for index in like}
+    ends = zip(posed.items(), design.poses([run.final_log for run in posed.values()]), strict=True)
+    errors = {index: math.hypot(*(end[-1, :2] - run.final_pose[:2])) for (index, run), end in ends}
     middle = {kind: sorted(like, key=lambda index: errors[index])[(len(like) - 1) // 2] for kind, like in kinds.items()}
     return {f"{kind}: {describe(runs[index])}": runs[index] for kind, index in middle.items()}
 
@@ -195,14 +197,14 @@ def wheel_rates(run: Trajectory, robot: Robot) -> FigureGrid:
         return [line(item, width, times - over / 2, row, hover=hover) for row in rows]
 
     rows = [[trace] for trace in lines(_MEAN, run.rates, 1.6, " rad/s")]
-    items, names, title = [_MEAN], [f"{name} (rad/s)" for name in robot.wheel_names], "Wheel rates"
+    items, names, caption = [_MEAN], [f"{name} (rad/s)" for name in robot.wheel_names], ""
     if run.targets is not None:
         for row, target in zip(rows, lines(_TARGET, run.targets, 1.2, " rad/s"), strict=True):
             row.append(target)
         error = run.rates - run.targets
         mean, rms = float(error.mean()), float(np.sqrt((error**2).mean()))
         decimals = decimals_for(rms, 2)
-        title += f"; measured − target: mean {fixed(mean, decimals)}, RMS {fixed(rms, decimals)} rad/s"
+        caption = f"Measured − target: mean {fixed(mean, decimals)}, RMS {fixed(rms, decimals)} rad/s."
         items.append(_TARGET)
     if run.steering is not None:
         rows += [[trace] for trace in lines(_STEERING, np.degrees(run.steering), 1.6, "°")]
@@ -217,8 +219,8 @@ def wheel_rates(run: Trajectory, robot: Robot) -> FigureGrid:
         for trace in row:
             trace.update(yaxis=f"y{index + 1}")
     figure = plot(*(trace for row in rows for trace in row), **layout)
-    height_px = _ROW * len(rows) + 60
-    return FigureGrid((Figure(title, figure, "Wheel rates over time, a row a wheel", height_px),), tuple(items), 1)
+    shown = Figure("Wheel rates", figure, "Wheel rates over time, a row a wheel", _ROW * len(rows) + 60)
+    return FigureGrid((shown,), tuple(items), 1, caption)
 
 
 def rate_step(trajectory: Trajectory) -> float | None:
