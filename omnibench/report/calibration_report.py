@@ -32,7 +32,7 @@ from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
 
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
-_ROWS = (("x", "m/rad"), ("y", "m/rad"), ("w", "rad/rad"))
+_ROWS = {"x": "m/rad", "y": "m/rad", "heading": "rad/rad"}
 _SCREEN = 12  # rows of parameters and elements, of which a terminal of 25 lines holds all that is said; chosen
 _TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
 _FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
@@ -166,11 +166,10 @@ class CalibrationResult(Result):
             columns["standard_deviation"] = np.sqrt(np.where(variances > 0, variances, np.nan))
         if self.run is not None and self.run.uncertainty is not None:
             columns |= {end: getattr(self.run.uncertainty.intervals, end) for end in ("low", "high")}
-        names = ("x", "y", "heading")
         named = {
-            "row": [name for name in names for _ in signals],
-            "signal": [*signals] * len(names),
-            "unit": [unit for _, unit in _ROWS for _ in signals],
+            "row": [row for row in _ROWS for _ in signals],
+            "signal": [*signals] * len(_ROWS),
+            "unit": [unit for unit in _ROWS.values() for _ in signals],
         }
         return pl.DataFrame(named | {name: each.ravel() for name, each in columns.items()}).fill_nan(None)
 
