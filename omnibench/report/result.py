@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from omnibench.report.blocks import Column, Document, FigureGrid, Row, Section, Table, Tone, answer_section
+from omnibench.report.blocks import Column, Document, FigureGrid, Row, Table, Tone
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -73,9 +73,7 @@ class Result:
 
     def document(self) -> Document:
         """The whole report."""
-        pictures = self.figures()
-        more = Section("tables", "In numbers", tuple(self.tables()))
-        return Document(self.title, "", (answer_section(self.sentence(), (), *pictures[:1] or (None,)), more))
+        raise NotImplementedError
 
     def json(self) -> Mapping[str, Any] | BaseModel:
         """The document of ``--json``."""

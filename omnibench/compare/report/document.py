@@ -27,7 +27,7 @@ from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import SPLITS
 from omnibench.errors import DataError
 from omnibench.report import blocks as page
-from omnibench.report.figures import DESIGN, is_drawn, motion_system, parameters
+from omnibench.report.figures import DESIGN, is_drawn, motion_system
 from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
 from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import reproduction_section
@@ -173,11 +173,9 @@ def _robot(view: sets.DatasetView) -> Iterator[page.Block]:
         if wheels:
             item = replace(style, key="fitted", colour=colour, dash="dash")
             fitted = [(item, robot.model_copy(update={"wheels": tuple(wheels)}))]
-    system, items = motion_system(robot)
-    legend = (*items, *(item for item, _ in fitted))
     words = "A wheel's width is not known; its length is its diameter."
     words += " A fitted geometry takes up whatever else is wrong with the model." if fitted else ""
-    yield page.FigureGrid((system, parameters(robot, fitted)), legend, 2, words, "robot")
+    yield replace(motion_system(robot, fitted), caption=words)
 
 
 def _recording(view: sets.DatasetView) -> Iterator[page.Block]:
