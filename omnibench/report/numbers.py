@@ -81,12 +81,6 @@ def power_of_ten(exponent: int) -> str:
     return plain.get(exponent, f"10{str(exponent).translate(_SUPERSCRIPT)}")
 
 
-def round_down(value: float) -> float:
-    """The largest of 1, 2, 5, 10, 20, ... and of 0.5, 0.2, ... that does not exceed ``value``, which is > 0."""
-    decade = 10.0 ** math.floor(math.log10(value))
-    return max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9))
-
-
 def span(low: float, high: float, decimals: int, signed: bool = False) -> str:
     """An interval: ``low to high``."""
     return f"{fixed(low, decimals, signed)} to {fixed(high, decimals, signed)}"
