@@ -446,18 +446,18 @@ def error_table(evaluation: Evaluation) -> page.Table:
             where += f", {({0: 'none', whole: 'all'}).get(part, f'{part:,}')} held out"
         if errors.outside is not None:
             where += f", {100 * errors.outside:.0f} % of the time outside of what it was fitted to"
+        rows.append(page.Row.of(where, role="group"))
         for label, each in (("calibration", errors), ("design", evaluation.design[split])):
             metres = (fixed(value, 4) for value in (each.position_mean_m, each.position_max_m))
             angles = (each.heading_mean_rad, each.heading_max_rad)
             degrees = (fixed(None if value is None else math.degrees(value), 2) for value in angles)
-            rows.append(page.Row.of(where, label, f"{each.cost:.4f}", *metres, *degrees))
-            where = ""
+            rows.append(page.Row.of(label, f"{each.cost:.4f}", *metres, *degrees))
     errors_of = (
         f"{what}, {which} ({unit})"
         for what, unit in (("position", "m"), ("heading", "deg"))
         for which in ("mean", "max")
     )
-    columns = page.columns("runs", page.Column("model", numeric=False), "Eq. (6)", *errors_of)
+    columns = page.columns("model", "Eq. (6)", *errors_of)
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; the errors are without it" if evaluation.loss else ""
     return page.Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note)
