@@ -72,8 +72,7 @@ def open_backend(
         return
     from omnibench.jobs.dask_backend import DaskBackend, dask_client
 
-    address = None if choice.name == "dask" else choice.name
-    with dask_client(address, choice.workers, choice.tls) as client:
+    with dask_client(None if choice.name == "dask" else choice.name, choice.workers, choice.tls) as client:
         backend = DaskBackend(client, preload, report)
         if choice.name.startswith("tcp:"):
             risk = f"whoever reaches {choice.name} runs code on its workers and here"

@@ -61,6 +61,8 @@ _SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "100 GB",  # data of jobs are kept by the scheduler on purpose
     "distributed.worker.memory.terminate": False,  # limits are those of jobs
     "distributed.worker.profile.enabled": False,  # nobody looks at it, and quick jobs pay for it
+    "distributed.admin.low-level-log-length": 10,  # copies of messages, which nobody reads
+    "distributed.admin.tick.interval": "500 ms",
     "distributed.comm.timeouts.connect": f"{WAIT} s",  # workers take long to join on a busy machine
     "distributed.deploy.lost-worker-timeout": f"{WAIT} s",  # a worker here that was killed is started again until then
 }
