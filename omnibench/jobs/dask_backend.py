@@ -312,19 +312,17 @@ def _prepared(requirements: bytes, address: str, folder: Path) -> tuple[dict[Pat
     except (OSError, DataError) as error:
         raise UnfitWorkerError(f"worker {address}: {error}") from None
     jobs = [(0, Job("plug-ins", _import_all, (plugins, failing)))] if plugins else []
-    for _, _, end in Processes(1, preload).run(jobs, bool, JobWatch()):  # in a process, which they may crash
-        if end.failure is not None:
-            reason = end.failure.error or f"its plug-ins cannot be imported there: {end.failure.reason}"
-            raise UnfitWorkerError(f"worker {address}: {reason}")
+    for _, _, end in Processes(1, preload).run(jobs, list, JobWatch()):  # in a process, which they may crash
+        crash = end.failure and f"its plug-ins cannot be imported there: {end.failure.reason}"
+        if flaws := [crash] if crash else end.encoded:
+            raise UnfitWorkerError(f"worker {address}: {flaws[0]}")
     return plugins, preload
 
 
-def _import_all(order: tuple[Mapping[Path, Path], frozenset[str]], _: Reporter) -> None:
+def _import_all(order: tuple[Mapping[Path, Path], set[str]], _: Reporter) -> list[str]:
     plugins, failing = order
-    for failure in import_copies(plugins):
-        if failure.origin not in failing:
-            what = f"plug-in {failure.origin} cannot be imported there: {failure.error}"
-            raise DataError(f"{what}; install on the worker what it needs")
+    what = "plug-in {0.origin} cannot be imported there: {0.error}; install on the worker what it needs"
+    return [what.format(failure) for failure in import_copies(plugins) if failure.origin not in failing]
 
 
 def held(data: bytes) -> bytes:
