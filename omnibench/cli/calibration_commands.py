@@ -188,7 +188,7 @@ def calibrate(
         write_text(output, to_yaml(run.calibration))
     again = ("omnibench", *sys.argv[1:], "-o", "calibration.yaml")
     result = CalibrationResult(run, recordings, file=output, sources=dataset, again=again, box=chosen.box)
-    page.write(result.document, announced=True)
+    page.write(result.page, announced=True)
     show(result, as_json)
 
 
@@ -232,7 +232,7 @@ def evaluate(
     if recordings is not None and evaluation is not None:
         warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
     result = EvaluationResult(evaluation, evaluated, predicted, recordings, calibration, dataset or (), warnings)
-    page.write(result.document, announced=True)
+    page.write(result.page, announced=True)
     show(result, as_json)
 
 

@@ -230,7 +230,7 @@ def check(
         checked = check_recording(read)
 
     result = CheckResult(checked, read.dataset, read.next_command())
-    page.write(result.document, announced=True)
+    page.write(result.page, announced=True)
     show(result, as_json)
     if checked.verdict != "ready":
         raise typer.Exit(1)
@@ -255,7 +255,7 @@ def inspect(
         recordings = omnibench.load_dataset(dataset)
         inspection = omnibench.inspect_dataset(recordings)
     result = InspectionResult(inspection, recordings, dataset)
-    page.write(result.document, announced=True)
+    page.write(result.page, announced=True)
     show(result, as_json)
 
 
@@ -289,7 +289,7 @@ def design(
         write_text(output / "design.json", to_json(chosen) + "\n")
     page = shared.ReportOptions(None if output is None else output / "report.html", figures)
     result = DesignResult(chosen, output)
-    page.write(result.document)
+    page.write(result.page)
     show(result, as_json)
 
 
@@ -320,7 +320,7 @@ def slam(
         result = ReferencePosesResult(request.run(watch, table_format), output, page.report)
         if page.asked:
             watch(Progress("writing the report"))
-        page.write(result.document)
+        page.write(result.page)
     show(result, as_json)
 
 

@@ -12,8 +12,10 @@ from pydantic import Field
 from omnibench import files
 from omnibench.config import Model, to_json, to_yaml
 from omnibench.discover.report.discovery_report import discovery_report
+from omnibench.discover.report.discovery_result import DiscoveryResult
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
 from omnibench.report.render import render
+from omnibench.report.result import with_next_step
 from omnibench.robot.kinematics import Array
 
 # First line of config.yaml: it tells a folder of results from one that happens to hold a file of that name.
@@ -55,10 +57,11 @@ def write_discovery(
     )
     with files.results_locked(chosen):
         check_output(folder, options, force=force)
+        shown = DiscoveryResult(discovery, chosen)
         texts = {
             "config.yaml": _config(options),
             "discovery.json": to_json(discovery_document(discovery, chosen)) + "\n",
-            "report.html": render(discovery_report(discovery, to_yaml(options))),
+            "report.html": render(with_next_step(discovery_report(discovery, to_yaml(options)), shown.next_step())),
             CALIBRATION_FILES["plain"]: to_yaml(discovery.plain),
         }
         if discovery.extends:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import ssl
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
-from urllib.parse import urlsplit
 
 from omnibench.config import Model
 from omnibench.errors import ConfigError, nearest
@@ -15,7 +15,7 @@ from omnibench.jobs.job_process import Processes
 from omnibench.progress import Progress, Reporter, no_progress
 
 _NAMES = ("processes", "dask")
-_SCHEMES = ("tcp", "tls")
+_ADDRESS = re.compile(r"(tcp|tls)://(\[[^/\]]+\]|[^/:\s]+):(?P<port>\d{1,5})", re.ASCII)
 
 
 class BackendChoice(Model):
@@ -31,13 +31,7 @@ class BackendChoice(Model):
 
 def name_flaw(name: str) -> str:
     """What is wrong with the name of a backend; empty if nothing is."""
-    scheme, _, place = name.partition("://")
-    try:
-        address = urlsplit(f"//{place}")
-        is_address = scheme in _SCHEMES and bool(address.hostname) and address.port is not None
-    except ValueError:  # a port that is no number, or too large a one
-        is_address = False
-    if name in _NAMES or is_address:
+    if name in _NAMES or ((address := _ADDRESS.fullmatch(name)) and int(address["port"]) < 2**16):
         return ""
     return f"unknown backend {name!r}; {nearest(name, _NAMES)}known: processes, dask, tcp://HOST:PORT, tls://HOST:PORT"
 
@@ -46,11 +40,10 @@ def check_backend(name: str, tls: TlsFiles | None = None) -> None:
     """ConfigError in one line: no such backend, Dask is not installed, or files of TLS are missing or of no use."""
     if flaw := name_flaw(name):
         raise ConfigError(flaw)
-    with_tls = name.startswith("tls:")
-    if with_tls and tls is None:
+    if tls is None and name.startswith("tls:"):
         raise ConfigError(f"backend {name}: name the files of TLS, ca, cert and key (--tls-ca, --tls-cert, --tls-key)")
     if tls is not None:
-        if not with_tls:
+        if not name.startswith("tls:"):
             raise ConfigError(f"backend {name}: files of TLS are for a scheduler at tls://HOST:PORT; leave them out")
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         what = f"ca: {tls.ca}: is no file of certificates in PEM"
@@ -74,16 +67,12 @@ def open_backend(
     """
     check_backend(choice.name, choice.tls)
     if choice.name == "processes":
-        processes = Processes(choice.workers, preload, lasting=True)
-        try:
+        with closing(Processes(choice.workers, preload, lasting=True)) as processes:
             yield processes
-        finally:
-            processes.close()
         return
     from omnibench.jobs.dask_backend import DaskBackend, dask_client
 
-    address = None if choice.name == "dask" else choice.name
-    with dask_client(address, choice.workers, choice.tls) as client:
+    with dask_client(None if choice.name == "dask" else choice.name, choice.workers, choice.tls) as client:
         backend = DaskBackend(client, preload, report)
         if choice.name.startswith("tcp:"):
             risk = f"whoever reaches {choice.name} runs code on its workers and here"

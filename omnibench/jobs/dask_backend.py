@@ -3,23 +3,32 @@
 Some quick jobs, or one that is not, are a task, and their ends its result. A worker has a task for each of its threads
 and none that waits, so that a worker that is killed takes only jobs that it had begun. They are tried again like jobs
 whose process was killed. (A scheduler that was not started here tries again by itself, by its own setting
-``allowed-failures``.)
+``allowed-failures``.) Beneath a worker jobs run in processes of their own, so that limits, isolation and threads are
+those of the processes of one machine, and results are equal to the bit. The software that results depend on is compared
+before the first job.
 """
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import logging
+import multiprocessing
+import os
 import pickle
+import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import cache
 from importlib.util import find_spec
 from itertools import islice
 from multiprocessing import resource_tracker
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -29,21 +38,20 @@ import dask
 import distributed
 from distributed import KilledWorker
 from distributed.client import FutureCancelledError
-from distributed.comm.core import CommClosedError, connect
-from distributed.core import send_recv
+from distributed.comm.core import CommClosedError
 
-from omnibench.errors import ConfigError, OmnibenchError, one_line
-from omnibench.jobs import dask_worker
-from omnibench.jobs.job import BackendError, Encode, Ends, Failure, Job, JobEnd, JobWatch, Numbered, TlsFiles
-from omnibench.jobs.job_process import Packer
+from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
+from omnibench.files import write_text
+from omnibench.jobs.job import BackendError, Encode, Ends, Failure, Job, JobEnd, JobWatch, Numbered, TlsFiles, software
+from omnibench.jobs.job_process import PackedJob, Packer, Processes
 from omnibench.processes import interrupts_blocked, main_module_hidden
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.registry import loaded_plugin_files, plugin_text
+from omnibench.registry import import_copies, loaded_plugin_files, plugin_text
 from omnibench.words import plural
 
 T = TypeVar("T")
 
-_CLIENT_CLOSED, _CLUSTER_CLOSED = 1.0, 5.0  # s in which they must have closed; chosen
+_CLOSED = 5.0  # s in which a client or a cluster must have closed; chosen
 _ANSWER = 10.0  # s in which a scheduler must answer; chosen
 # s in which a worker must be there, or there again, and a scheduler at work must answer: workers of a batch system
 # start with the first job (chosen).
@@ -61,6 +69,13 @@ _SETTINGS = {
 _STARTS = 3  # tries to start a cluster here, as a worker may be killed while it starts; chosen
 _LOOK = 1.0  # s between two looks at the scheduler and its workers; chosen
 _BATCH, _LARGEST_BATCH = 0.5, 100  # s of work, and jobs, that travel together: a task costs 5 ms in all; chosen
+_PROBE = 1_000_000  # bytes that a worker must be able to write: a plug-in's file and what a job notes down (chosen)
+
+_preparing, _taking_slots = threading.Lock(), threading.Lock()
+
+
+class UnfitWorkerError(BackendError):
+    """A worker on which results could differ from the client's, or that cannot run jobs."""
 
 
 class ClusterLostError(BackendError):
@@ -80,18 +95,18 @@ def dask_client(address: str | None, workers: int, tls: TlsFiles | None) -> Iter
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # each has a level of its own
     with warnings.catch_warnings(), dask.config.set(_SETTINGS):
         warnings.filterwarnings("ignore", module="distributed")
-        with _local_client(workers) if address is None else _closing(_joined(address, tls), _CLIENT_CLOSED) as client:
+        with _local_client(workers) if address is None else _closing(_joined(address, tls)) as client:
             yield client
 
 
 @contextmanager
-def _closing(opened: Any, seconds: float) -> Iterator[Any]:
+def _closing(opened: Any) -> Iterator[Any]:
     """Close a client or a cluster after the block, whose end counts: that they do not close in time is not told."""
     try:
         yield opened
     finally:
         with suppress(OSError):  # TimeoutError and CommClosedError are some
-            opened.close(timeout=seconds)
+            opened.close(timeout=_CLOSED)
 
 
 @contextmanager
@@ -99,69 +114,53 @@ def _local_client(workers: int) -> Iterator[Any]:
     """A client of a cluster of this machine's processes, which leave Ctrl-C to this one."""
     resource_tracker.ensure_running()  # the first worker would start it, and unblock what is blocked
     # The cluster has certificates of its own: other users of this machine cannot join.
-    options = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": None, "security": True}
+    options = {"threads_per_worker": 1, "memory_limit": None, "security": True, "dashboard_address": "127.0.0.1:8787"}
     with main_module_hidden():  # a worker that died is started again at any time
-        for tried in range(1, _STARTS + 1):
+        for _ in range(_STARTS):
             try:
                 with interrupts_blocked():
-                    cluster = distributed.LocalCluster(
-                        **options, dashboard_address="127.0.0.1:8787", silence_logs=logging.CRITICAL
-                    )
+                    cluster = distributed.LocalCluster(workers, silence_logs=logging.CRITICAL, **options)
                 break
             except (RuntimeError, OSError) as error:
-                if tried == _STARTS:
-                    raise ClusterLostError(
-                        f"no workers of Dask start here ({one_line(str(error))}), in {_STARTS} tries; results so "
-                        "far are kept: free memory or take fewer workers, then the same command"
-                    ) from None
-        with (
-            _closing(cluster, _CLUSTER_CLOSED),
-            _closing(distributed.Client(cluster, set_as_default=False), _CLIENT_CLOSED) as client,
-        ):
+                reason = one_line(str(error))
+        else:
+            raise ClusterLostError(
+                f"no workers of Dask start here ({reason}), in {_STARTS} tries; results so far are kept: free memory "
+                "or take fewer workers, then the same command"
+            )
+        with _closing(cluster), _closing(distributed.Client(cluster, set_as_default=False)) as client:
             yield client
 
 
 def _joined(address: str, tls: TlsFiles | None) -> Any:
     """A client of a scheduler that runs already."""
-    security = None
-    if tls is not None:
-        security = distributed.Security(
-            tls_ca_file=str(tls.ca), tls_client_cert=str(tls.cert), tls_client_key=str(tls.key), require_encryption=True
-        )
+    files = {} if tls is None else {"ca_file": tls.ca, "client_cert": tls.cert, "client_key": tls.key}
+    options = {f"tls_{part}": str(file) for part, file in files.items()}
+    security = distributed.Security(**options, require_encryption=tls is not None)
+    arguments = security.get_connection_args("client")
+
+    async def listener() -> tuple[str, str]:
+        """Who listens and, of a scheduler, the version. A client would wait without end for what is none."""
+        place = urlsplit(address)
+        await asyncio.get_running_loop().getaddrinfo(place.hostname, place.port)  # an unknown host is said at once
+        async with asyncio.timeout(_ANSWER + 1), distributed.rpc(address, None, True, _ANSWER, arguments) as asked:
+            kind = (await asked.identity())["type"]
+            return kind, (await asked.versions())["packages"]["distributed"] if kind == "Scheduler" else ""
+
+    here = software()["distributed"]
     try:
         with ThreadPoolExecutor(1) as thread:  # a notebook has a loop of its own in this one
-            kind = thread.submit(asyncio.run, _kind(address, security)).result()
-        if kind != "Scheduler":
-            raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
-        client: Any = distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
-        there, here = (
-            client.get_versions()["scheduler"]["packages"]["distributed"],
-            dask_worker.software()["distributed"],
-        )
-        if there != here:
-            client.close(timeout=_CLIENT_CLOSED)
-            raise ConfigError(f"scheduler {address} has distributed {there} (here: {here}); install the same")
-    except ConfigError:
-        raise
+            kind, there = thread.submit(asyncio.run, listener()).result()
+        if kind == "Scheduler" and there == here:
+            return distributed.Client(address, timeout=_ANSWER, set_as_default=False, security=security)
     except Exception as error:  # sockets, TLS and the protocol of another version raise what they like
         reason = one_line(str(error) or f"whoever listens there says nothing that Dask knows within {_ANSWER:g} s")
         raise ConfigError(
             f"no Dask scheduler answers at {address} ({reason}); start one (dask scheduler), or correct the address"
         ) from None
-    return client
-
-
-async def _kind(address: str, security: Any) -> str:
-    """The kind of who listens. A client waits without end where it is no scheduler, but a web server or a worker."""
-    place = urlsplit(address)
-    await asyncio.get_running_loop().getaddrinfo(place.hostname, place.port)  # an unknown host is said at once
-    arguments = {} if security is None else security.get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, timeout=_ANSWER, **arguments), _ANSWER + 1)
-    try:
-        identity = await asyncio.wait_for(send_recv(comm, op="identity", reply=True), _ANSWER)
-    finally:
-        comm.abort()
-    return str(identity["type"])
+    if kind == "Scheduler":
+        raise ConfigError(f"scheduler {address} has distributed {there} (here: {here}); install the same")
+    raise ConfigError(f"{address} is a {kind.lower()} of Dask; give the address of its scheduler")
 
 
 class DaskBackend:
@@ -175,23 +174,18 @@ class DaskBackend:
         self.client, self._report = client, report
         self._packer = Packer()
         self._data: dict[str, Any] = {}  # futures, by name
-        self._without: float | None = None  # time since which there has been no worker
+        self._missing, self._since = False, 0.0  # whether there is no worker, and the time since which it is so
         plugins = loaded_plugin_files()
-        self._requirements = pickle.dumps(
-            dask_worker.Requirements(
-                software=dask_worker.software(),
-                plugins={path: plugin_text(path) for path in plugins},
-                failing=frozenset(failure.origin for failure in plugins.values() if failure is not None),
-                preload=tuple(preload),
-            )
-        )
-        answers = client.run(dask_worker.prepare, self._requirements, on_error="return")
+        texts = {path: plugin_text(path) for path in plugins}
+        failing = {failure.origin for failure in plugins.values() if failure is not None}  # and may fail there, too
+        self._requirements = pickle.dumps((software(), texts, failing, tuple(preload)))
+        answers = client.run(prepare, self._requirements, on_error="return")
         for worker, answer in answers.items():
             if isinstance(answer, OmnibenchError):
                 raise answer
             if isinstance(answer, BaseException):  # another Python, or no omnibench
                 reason = one_line(f"worker {worker} cannot run omnibench's jobs ({type(answer).__name__}: {answer})")
-                raise dask_worker.UnfitWorkerError(f"{reason}; install the same there")
+                raise UnfitWorkerError(f"{reason}; install the same there")
         page = client.dashboard_link
         if find_spec("bokeh") is None:  # which the dashboard needs; these pages do not
             page = page.replace("/status", "/info/main/workers.html")
@@ -236,11 +230,10 @@ class DaskBackend:
                     else:
                         ((number, job),) = ended.items()
                         yield number, job, JobEnd(failure=failure)
-                elif isinstance(error, OmnibenchError):
-                    raise error  # a worker joined later and is unfit
                 elif error is not None:
                     reason = one_line(f"{type(error).__name__}: {error}")
-                    raise BackendError(f"a Dask worker failed ({reason}); start it again")
+                    failed = BackendError(f"a Dask worker failed ({reason}); start it again")
+                    raise error if isinstance(error, OmnibenchError) else failed  # a worker joined later and is unfit
                 else:
                     ends, spent = future.result()
                     free.append(worker)
@@ -259,34 +252,121 @@ class DaskBackend:
 
     def _submit(self, batch: dict[int, Job[T]], encode: Encode, worker: str) -> Any:
         """The future of a batch's task, for another worker if this one is gone."""
-        packed = tuple((number, self._packer.pack(job)) for number, job in batch.items())
-        names = tuple({name: None for _, job in packed for name in job.names})
-        timed = any(job.timed for job in batch.values())
-        needed = {"requirements": self._requirements} | {name: self._packer.shared[name] for name in names}
+        packed = {number: self._packer.pack(job) for number, job in batch.items()}
+        needed = {name: content for job in packed.values() for name, content in job.shared.items()}
+        needed["requirements"] = self._requirements
         for name, content in needed.items():  # which goes to the scheduler once, and from there to workers that need it
             if name not in self._data or self._data[name].status == "error":  # workers were killed that were to hold it
                 key = f"omnibench-data-{name}-{uuid4().hex[:8]}"
-                self._data[name] = self.client.submit(dask_worker.content, content, key=key)
-        data = [self._data[name] for name in needed]
+                self._data[name] = self.client.submit(held, content, key=key)
+        light = [(number, replace(job, shared=dict.fromkeys(job.shared, b""))) for number, job in packed.items()]
+        timed, data = any(job.timed for job in batch.values()), {name: self._data[name] for name in needed}
         options = {"workers": [worker], "allow_other_workers": True, "pure": False}
-        return self.client.submit(dask_worker.carry_out, packed, names, encode, timed, *data, **options)
+        return self.client.submit(carry_out, light, encode, timed, data, **options)
 
     def _free(self, busy: Iterable[str]) -> list[str]:
         """A worker for each of its threads that is not ``busy``. ClusterLostError: no worker for long."""
         if self.client.status != "running":
             raise CommClosedError
         threads = Counter[str](self.client.sync(self.client.scheduler.ncores, callback_timeout=WAIT))
-        if threads:
-            if self._without is not None:
-                self._report(Progress("waiting for a worker", result=""))
-            self._without = None
-        elif self._without is None:
-            self._without = time.monotonic()
-            self._report(Progress("waiting for a worker"))
-        elif time.monotonic() - self._without > WAIT:
+        if (missing := not threads) != self._missing:
+            self._missing, self._since = missing, time.monotonic()
+            self._report(Progress("waiting for a worker", result=None if missing else ""))
+        if missing and time.monotonic() - self._since > WAIT:
             address = self.client.scheduler.address
             raise ClusterLostError(
                 f"no worker has been left at the Dask scheduler {address} for {WAIT:g} s; start some "
                 f"(dask worker {address}), then the same command"
             )
         return [*(threads - Counter(busy)).elements()]
+
+
+def prepare(requirements: bytes, dask_worker: Any) -> tuple[dict[Path, Path], tuple[str, ...]]:
+    """Check a worker, once for the same requirements: copies of plug-in files there, and modules to preload.
+
+    UnfitWorkerError in one line: results could differ there, or it cannot run jobs.
+    """
+    with _preparing:
+        return _prepared(requirements, dask_worker.address, Path(dask_worker.local_directory))
+
+
+@cache
+def _prepared(requirements: bytes, address: str, folder: Path) -> tuple[dict[Path, Path], tuple[str, ...]]:
+    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # a nanny's: with it arrays take half as long again as at home
+    multiprocessing.current_process().daemon = False  # a nanny's workers may not start processes otherwise
+    here, texts, failing, preload = pickle.loads(requirements)
+    there = software()
+    names = [name for name in here | there if here.get(name) != there.get(name)]
+    if wrong := [f"{name} {there.get(name, 'missing')} (here: {here.get(name, 'missing')})" for name in names]:
+        raise UnfitWorkerError(
+            f"worker {address} has {', '.join(wrong)}: results could differ; install the same on the worker, or work "
+            "with workers that have it"
+        )
+    copies = folder / f"omnibench-{hashlib.sha256(requirements).hexdigest()[:10]}"
+    plugins = {path: copies / str(number) / path.name for number, path in enumerate(texts)}
+    try:
+        write_text(copies / "probe", " " * _PROBE)
+        (copies / "probe").unlink()
+        for path, copy in plugins.items():
+            write_text(copy, texts[path])
+    except (OSError, DataError) as error:
+        raise UnfitWorkerError(f"worker {address}: {error}") from None
+    jobs = [(0, Job("plug-ins", _import_all, (plugins, failing)))] if plugins else []
+    for _, _, end in Processes(1, preload).run(jobs, list, JobWatch()):  # in a process, which they may crash
+        crash = end.failure and f"its plug-ins cannot be imported there: {end.failure.reason}"
+        if flaws := [crash] if crash else end.encoded:
+            raise UnfitWorkerError(f"worker {address}: {flaws[0]}")
+    return plugins, preload
+
+
+def _import_all(order: tuple[Mapping[Path, Path], set[str]], _: Reporter) -> list[str]:
+    plugins, failing = order
+    what = "plug-in {0.origin} cannot be imported there: {0.error}; install on the worker what it needs"
+    return [what.format(failure) for failure in import_copies(plugins) if failure.origin not in failing]
+
+
+def held(data: bytes) -> bytes:
+    """Task that holds data for jobs: where all workers that hold it are lost, the scheduler runs it again."""
+    return data
+
+
+def carry_out(
+    jobs: Sequence[tuple[int, PackedJob]], encode: Encode, timed: bool, data: Mapping[str, bytes]
+) -> tuple[list[tuple[int, JobEnd]], float]:
+    """Task of some jobs, one after the other: their ends, and the seconds that they took.
+
+    timed: they have the worker to themselves. data: requirements, and contents of what the jobs share.
+    UnfitWorkerError: this worker joined after the first job, and is not as it must be.
+    """
+    worker: Any = distributed.get_worker()
+    key, (plugins, preload) = worker.get_current_task(), prepare(data["requirements"], worker)
+    pool = _processes(threading.get_ident(), preload)
+    whole = [(number, replace(job, shared={name: data[name] for name in job.shared})) for number, job in jobs]
+    slots, taken = _slots(worker.state.nthreads), worker.state.nthreads if timed else 1
+
+    def wanted() -> bool:
+        task = worker.state.tasks.get(key)  # none once the client is gone
+        return task is not None and task.state != "cancelled"
+
+    with _taking_slots:  # one after the other, or two that need several would wait for each other
+        for _ in range(taken):
+            slots.acquire()
+    try:
+        began = time.monotonic()
+        ends = [
+            (number, replace(end, failure=end.failure and replace(end.failure, worker=worker.address)))
+            for number, _, end in pool.run(whole, encode, JobWatch(), plugins, wanted)
+        ]
+        return ends, time.monotonic() - began
+    finally:
+        slots.release(taken)
+
+
+@cache
+def _processes(thread: int, preload: tuple[str, ...]) -> Processes:  # noqa: ARG001 (each thread has its own)
+    return Processes(1, (__name__, *preload), lasting=True)
+
+
+@cache
+def _slots(count: int) -> threading.Semaphore:
+    return threading.Semaphore(count)

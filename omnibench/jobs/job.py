@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import platform
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
+from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -22,10 +24,13 @@ from omnibench.config import Model, RelativePath
 from omnibench.errors import DataError, OmnibenchError, one_line
 from omnibench.files import remove, write_text
 from omnibench.progress import Progress, Reporter, expect_reading, no_progress, tell_reading
+from omnibench.registry import REGISTRIES
 
 T = TypeVar("T")
 Encode = Callable[[Any], Any]  # see Store
 
+_PACKAGE = Path(__file__).parents[1]
+_NUMERICAL = ("numpy", "scipy", "cvxpy", "clarabel", "nlopt", "cma", "polars", "numba", "pydantic", "shapely")
 TRIES = 3  # how often a job whose process or worker is killed is begun: two chances that memory is free again; chosen
 
 
@@ -59,6 +64,18 @@ def code_digest(package: Path, files: Iterable[Path]) -> str:
         digest.update(file.relative_to(package).as_posix().encode())
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
+
+
+@cache
+def software() -> dict[str, str]:
+    """Versions of Python and of packages, omnibench's code by its hash, and installed packages of plug-ins."""
+    points = {point for registry in REGISTRIES for point in entry_points(group=registry.group)}
+    return {
+        "Python": platform.python_version(),
+        "omnibench's code": code_digest(_PACKAGE, _PACKAGE.rglob("*.py"))[:10],
+        **{package: version(package) for package in (*_NUMERICAL, "dask", "distributed")},
+        **{point.dist.name: point.dist.version for point in points if point.dist is not None},
+    }
 
 
 class Store(Protocol[T]):

@@ -10,8 +10,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from io import BytesIO, TextIOWrapper
@@ -26,6 +26,7 @@ from omnibench.progress import Progress
 from omnibench.registry import import_copies
 
 T = TypeVar("T")
+J = TypeVar("J", bound="Job[Any] | PackedJob")
 
 _MEGABYTE = 1_000_000  # bytes
 _LIFE = 60.0  # s in which a process takes further jobs without limits, so that memory and caches end with it; chosen
@@ -57,19 +58,18 @@ def memory_limit() -> float | None:
 
 def _oom_kills() -> int:
     """Number of processes that the system has killed for lack of memory; 0 where it does not say (not Linux)."""
-    try:
+    with suppress(OSError):
         counts = Path("/proc/vmstat").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return sum(int(line.split()[1]) for line in counts if line.startswith("oom_kill "))
+        return sum(int(line.split()[1]) for line in counts if line.startswith("oom_kill "))
+    return 0
 
 
 @dataclass(frozen=True)
 class PackedJob:
-    """A job as it travels. content: its function and argument, pickled without what it shares, whose names are here."""
+    """A job as it travels. content: its function and argument, pickled without what is in ``shared``, by its hash."""
 
     content: bytes
-    names: tuple[str, ...]
+    shared: Mapping[str, bytes]
     seconds: float | None
     memory_mb: float | None
 
@@ -80,25 +80,23 @@ class PackedJob:
 
 
 class Packer:
-    """Pickles jobs. Objects that they share are pickled once and named by a hash. shared: their contents by name."""
+    """Pickles jobs, and once what they share."""
 
     def __init__(self) -> None:
-        self.shared: dict[str, bytes] = {}
-        self._named: dict[int, tuple[Any, str]] = {}  # by id: the object, which is kept alive, and its name
+        self._shared: dict[int, tuple[Any, str, bytes]] = {}  # by id: the object, kept alive, its hash and content
 
     def pack(self, job: Job[Any]) -> PackedJob:
-        """The job without what it shares, which is added to ``shared``."""
+        """The job as it travels."""
         for value in job.shared:
-            if id(value) not in self._named:
+            if id(value) not in self._shared:
                 content = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-                self._named[id(value)] = value, hashlib.sha256(content).hexdigest()[:20]
-                self.shared[self._named[id(value)][1]] = content
-        names = {id(value): self._named[id(value)][1] for value in job.shared}
+                self._shared[id(value)] = value, hashlib.sha256(content).hexdigest()[:20], content
+        shared = {id(value): self._shared[id(value)][1:] for value in job.shared}
         stream = BytesIO()
         pickler = pickle.Pickler(stream, pickle.HIGHEST_PROTOCOL)
-        pickler.persistent_id = lambda value: names.get(id(value))  # type: ignore[method-assign]
+        pickler.persistent_id = lambda value: shared.get(id(value), (None,))[0]  # type: ignore[method-assign]
         pickler.dump((job.function, job.argument))
-        return PackedJob(stream.getvalue(), tuple(names.values()), job.seconds, job.memory_mb)
+        return PackedJob(stream.getvalue(), dict(shared.values()), job.seconds, job.memory_mb)
 
 
 class _JobProcess:
@@ -110,35 +108,30 @@ class _JobProcess:
         with processes.interrupts_deferred(), processes.main_module_hidden():
             self._process.start()
         far.close()
+        self.signs = self.connection, self._process.sentinel  # for ``wait``: ready when ``receive`` has more to tell
         self._began = time.monotonic()
-        self._sent: tuple[str, ...] = ()  # names of shared objects that are there
-
-    @property
-    def signs(self) -> tuple[Connection, int]:
-        """What multiprocessing's ``wait`` takes: ready when ``receive`` has something to tell."""
-        return self.connection, self._process.sentinel
+        self._sent: Mapping[str, bytes] = {}  # shared objects that are there
 
     @property
     def usable(self) -> bool:
         """True if it may do a further job."""
         return time.monotonic() - self._began <= _LIFE and self._process.is_alive()
 
-    def give(self, job: PackedJob, *given: Any, shared: Mapping[str, bytes]) -> None:
-        """Begin a job. given: ``encode`` and ``plugins`` of ``Processes.events``."""
+    def give(self, job: PackedJob, *given: Any) -> None:
+        """Begin a job. given: ``encode`` and ``plugins`` of ``Processes.run``."""
         self.job, self._kills = job, _oom_kills()
         self._deadline = None if job.seconds is None else time.monotonic() + job.seconds
-        missing = {name: shared[name] for name in job.names if name not in self._sent}
-        self._sent = job.names
+        missing = {name: content for name, content in job.shared.items() if name not in self._sent}
+        self._sent = job.shared
         with suppress(BrokenPipeError, ConnectionResetError):  # it died: ``receive`` tells how
-            self.connection.send((job, missing, *given))
+            self.connection.send((job.content, [*job.shared], missing, job.memory_mb, *given))
 
     def receive(self) -> Progress | JobEnd | None:
         """A report or the end of the job, None if there is none yet. After an end by force the process is gone."""
         dead = not self._process.is_alive()  # asked before what it sent is read, so that nothing is left when it died
         try:
             if self.connection.poll():
-                message: Progress | JobEnd = self.connection.recv()
-                return message
+                return cast(Progress | JobEnd, self.connection.recv())
         except (EOFError, OSError):  # it is about to die, or a plug-in has closed its end
             self._process.join(_CLOSED)
             dead = True
@@ -185,27 +178,25 @@ def _serve(connection: Connection) -> None:
 
 def _do(connection: Connection, shared: dict[str, Any]) -> JobEnd:
     """Take a job and run it. shared: objects of the job before, and then of this one, by name."""
-    sent: Progress | None = None
     last: Progress | None = None
-    sent_at, process, memory_mb = 0.0, os.getpid(), None
+    task, sent_at, process, memory_mb = "", -_PERIOD, os.getpid(), None
 
     def report(event: Progress) -> None:
-        nonlocal sent, sent_at, last
+        nonlocal last, task, sent_at
         last = event
-        if sent is None or event.task != sent.task or time.monotonic() - sent_at >= _PERIOD:
+        if event.task != task or time.monotonic() - sent_at >= _PERIOD:
             with suppress(OSError):  # a plug-in may have closed it
                 connection.send(event)
-            sent, sent_at = event, time.monotonic()
+            task, sent_at = event.task, time.monotonic()
 
     try:
-        job, missing, encode, plugins = connection.recv()
-        memory_mb = job.memory_mb
+        content, names, missing, memory_mb, encode, plugins = connection.recv()
         import_copies(plugins)
         shared.update({name: pickle.loads(content) for name, content in missing.items()})
         missing.clear()
-        for name in shared.keys() - set(job.names):
+        for name in shared.keys() - set(names):
             del shared[name]
-        unpickler = pickle.Unpickler(BytesIO(job.content))
+        unpickler = pickle.Unpickler(BytesIO(content))
         unpickler.persistent_load = shared.__getitem__  # type: ignore[method-assign]
         function, argument = unpickler.load()
         try:
@@ -256,63 +247,48 @@ class Processes:
     lasting: bool = False
     _idle: list[_JobProcess] = field(default_factory=list, init=False, repr=False, compare=False)
 
-    def run(self, jobs: Iterable[Numbered[T]], encode: Encode, watch: JobWatch[T]) -> Ends[T]:
-        """Run the jobs, see Backend."""
-        if _in_job:
-            yield from InPlace().run(jobs, encode, watch)
-            return
-        packer, taken = Packer(), dict[int, Job[T]]()
-
-        def packed() -> Iterator[tuple[int, PackedJob]]:  # which is asked for a job when a process is free
-            for number, job in jobs:
-                taken[number] = job
-                watch.began(number)
-                yield number, packer.pack(job)
-
-        with closing(self.events(packed(), packer.shared, encode)) as events:
-            for number, event in events:
-                if isinstance(event, JobEnd):
-                    yield number, taken.pop(number), event
-                else:
-                    watch.moved(number, event)
-
-    def events(
+    def run(
         self,
-        jobs: Iterable[tuple[int, PackedJob]],
-        shared: Mapping[str, bytes],
+        jobs: Iterable[tuple[int, J]],
         encode: Encode,
+        watch: JobWatch[Any],
         plugins: Mapping[Path, Path] | None = None,
         wanted: Callable[[], bool] = lambda: True,
-    ) -> Generator[tuple[int, Progress | JobEnd], None, None]:
-        """Run packed jobs and yield their reports and ends; all stop once ``wanted`` is false.
+    ) -> Generator[tuple[int, J, JobEnd], None, None]:
+        """Run the jobs, packed or not, see Backend; all stop once ``wanted`` is false.
 
-        shared: contents of what they share. plugins: copies of plug-in files here, by their paths at home.
+        plugins: copies of plug-in files here, by their paths at home.
         """
-        waiting = iter(jobs)
-        active: dict[_JobProcess, int] = {}
+        if _in_job:
+            yield from cast(Any, InPlace().run)(jobs, encode, watch)
+            return
+        waiting, packer = iter(jobs), Packer()
+        active: dict[_JobProcess, tuple[int, J]] = {}
         with processes.one_thread_processes((*PRELOAD, *self.preload)) as context:
             try:
                 while True:
                     while len(active) < self.workers and (item := next(waiting, None)) is not None:
-                        number, job = item
+                        watch.began(item[0])
+                        packed = item[1] if isinstance(item[1], PackedJob) else packer.pack(item[1])
                         while self._idle and not self._idle[-1].usable:
                             self._idle.pop().end()
-                        process = self._idle.pop() if self._idle and not job.limited else _JobProcess(context)
-                        active[process] = number
-                        process.give(job, encode, plugins or {}, shared=shared)
+                        process = self._idle.pop() if self._idle and not packed.limited else _JobProcess(context)
+                        active[process] = item
+                        process.give(packed, encode, plugins or {})
                     if not active or not wanted():
                         return
                     wait([sign for process in active for sign in process.signs], timeout=_PERIOD)
-                    for process, number in [*active.items()]:
+                    for process, (number, job) in [*active.items()]:
                         event = process.receive()
-                        if isinstance(event, JobEnd):
+                        if isinstance(event, Progress):
+                            watch.moved(number, event)
+                        elif event is not None:
                             del active[process]
                             if event.failure is None and not process.job.limited:
                                 self._idle.append(process)
                             else:
                                 process.end()
-                        if event is not None:
-                            yield number, event
+                            yield number, job, event
             finally:
                 for process in active:
                     process.end()

@@ -77,6 +77,15 @@ class Column:
     priority: int = 0
 
 
+def columns(first: str | Column, *others: str | Column) -> tuple[Column, ...]:
+    """Columns by their headings, a unit in brackets: names in the first, numbers in the others, unless one is given."""
+    found = [Column(first, numeric=False) if isinstance(first, str) else first]
+    for other in others:
+        title, _, unit = other.partition(" (") if isinstance(other, str) else ("", "", "")
+        found.append(Column(title, unit.rstrip(")")) if isinstance(other, str) else other)
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class Cell:
     """A table cell: a value, a ``note`` below it in small print, and a swatch of ``colour`` before it."""
@@ -172,7 +181,6 @@ class Details:
     kind: ClassVar[str] = "details"
     title: str
     blocks: tuple[Block, ...]
-    open: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -14,30 +15,30 @@ import polars as pl
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.fit.calibrate import CalibrationRun
-from omnibench.fit.evaluate import Evaluation, SplitErrors, final_errors, positions_and_headings
+from omnibench.fit.evaluate import Evaluation, ModelErrors, SplitErrors
 from omnibench.fit.path_errors import PathError, predicted_errors
 from omnibench.report import blocks as page
-from omnibench.report.figures import drawn, marks
+from omnibench.report.figures import drawn
 from omnibench.report.numbers import NOTHING, fixed, noise_in_words, percent, significant, typeset
 from omnibench.report.path_pictures import CALIBRATED, DESIGN_ITEM, Models, paths_before_after
+from omnibench.report.recording.recording_figures import kinds_of
 from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import plot, text
 from omnibench.robot.calibration import Calibration, HeldOutVerdict
 from omnibench.robot.export.formats import export_calibration, left_out
-from omnibench.robot.kinematics import Array, relative_deviations
+from omnibench.robot.kinematics import relative_deviations
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.physical import PhysicalParameter
 from omnibench.words import plural
 
 _CALIBRATED = page.LegendItem("calibrated", "calibration", CALIBRATED)
-_ROWS = (("x", "m/rad"), ("y", "m/rad"), ("w", "rad/rad"))
-_COLUMNS = 3  # drive signals whose elements stand side by side in 80 columns; of more, each has a row
-_SCREEN, _WIDTH = 25, 80  # lines and columns of a terminal that hold the answer
-_ENDING = (96 * ".", "COMMAND")  # as long as the sentence that a command ends with
+_ROWS = {"x": "m/rad", "y": "m/rad", "heading": "rad/rad"}
+_SCREEN = 12  # rows of parameters and elements, of which a terminal of 25 lines holds all that is said; chosen
 _TONES: Mapping[str, page.Tone] = {"better": "good", "worse": "bad", "undecided": "warning", "unknown": "plain"}
 _FINAL = ("trajectories", "cost", "position_mean_m", "position_max_m", "heading_mean_rad", "heading_max_rad")
-_TURNS = 0.35  # rad: a run that turns less in all is straight; chosen
-_ON_THE_SPOT = 0.5  # m a radian: a run that drives less turns on the spot, as seen from the wheels' reach; chosen
+_MODELS: tuple[Literal["design", "calibration"], ...] = ("design", "calibration")
+_UNITS = {"position": "mm", "heading": "deg"}
+_NOT_JUDGED = HeldOutVerdict(verdict="unknown", sentence="not judged by other runs", detail="")
 
 
 class CalibrationResult(Result):
@@ -60,12 +61,15 @@ class CalibrationResult(Result):
         self.box = "" if box is None else f" {box!r}"
         self.run = shown if isinstance(shown, CalibrationRun) else None
         self.calibration = shown.calibration if isinstance(shown, CalibrationRun) else shown
-        origin = self.calibration.provenance
-        self.verdict = verdict or (None if origin is None else origin.held_out)
         self.dataset, self.file, self.sources, self.again = dataset, file, sources, again
-        self.parameters = _physical(self.calibration)
+        name, robot, origin = self.calibration.name, self.calibration.robot.name, self.calibration.provenance
+        self.verdict = verdict or (None if origin is None else origin.held_out)
+        try:
+            self.parameters: Mapping[str, PhysicalParameter] = self.calibration.physical_parameters
+        except DataError:  # no wheels near the design have this matrix
+            self.parameters = {}
         fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
-        name, robot = self.calibration.name, self.calibration.robot.name
+        self.heading = f"{name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
         self.title = f"{type(shown).__name__} {name!r} of robot {robot}{fitted}"
 
     @property
@@ -92,29 +96,19 @@ class CalibrationResult(Result):
         return next_step(self.calibration, self.verdict, self.file, self.sources)
 
     def tables(self) -> Sequence[page.Table]:
-        """Parameters, and the matrix as far as a screen holds both."""
+        """Parameters, and the elements of the matrix as far as a screen holds both."""
         if not self.parameters:
-            return [self._elements()]
-        tables = [parameter_table(self.calibration, self._heading), self.matrix_table()]
-        lines = [*self.warnings, *(remark.text for remark in self._beside), *_ENDING]
-        height = sum(-(-len(line) // _WIDTH) for line in lines) + sum(2 + len(table.rows) for table in tables)
-        return tables if height <= _SCREEN else tables[:1]
-
-    @property
-    def _heading(self) -> str:
-        origin = self.calibration.provenance
-        return f"{self.calibration.name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
+            return [self.elements()]
+        tables = [parameter_table(self.calibration, self.heading), self.elements("matrix")]
+        rows = sum(len(table.rows) for table in tables) + 2 * len(self.warnings)
+        return tables if rows <= _SCREEN else tables[:1]
 
     def remarks(self) -> Sequence[Remark]:
-        if len(self.tables()) == 2 or not self.parameters:
-            return self._beside
-        size = f"3 x {len(self.calibration.matrix[0])}"
-        return [Remark(f"matrix ({size}): not on this screen; --json shows it, -o writes it"), *self._beside]
-
-    @property
-    def _beside(self) -> list[Remark]:
-        """What is said below the tables, whether or not the matrix is among them."""
         lines, run = list[str](), self.run
+        if self.parameters and len(self.tables()) < 2:
+            size = f"3 x {len(self.calibration.matrix[0])}"
+            lines.append(f"matrix ({size}): not on this screen; --json shows it, -o writes it")
+            lines += filter(None, [self._kept])
         if run is not None and run.uncertainty is not None:
             lines.append(f"95 % intervals: {run.uncertainty.source}")
         if run is not None and run.result.outcome != "converged":
@@ -128,25 +122,21 @@ class CalibrationResult(Result):
 
     def document(self) -> page.Document:
         assert self.dataset is not None
-        verdict = self.verdict or HeldOutVerdict(verdict="unknown", sentence="not judged by other runs", detail="")
-        return calibration_document(self.calibration, self.dataset, verdict, self.run.warnings if self.run else ())
+        warnings = self.run.warnings if self.run else ()
+        return calibration_document(self.run or self.calibration, self.dataset, self.verdict or _NOT_JUDGED, warnings)
 
-    def matrix_table(self) -> page.Table:
-        """The matrix with its deviation from the design values: a column a drive signal, of more than three a row."""
-        calibration, drive = self.calibration, self.calibration.robot.drive
-        shares = relative_deviations(calibration.matrix_array, calibration.robot.inverse_kinematic_matrix)
-        cells = [
-            [page.Cell(f"{value:+.7f}", _deviation(share)) for value, share in zip(*row, strict=True)]
-            for row in zip(calibration.matrix, shares, strict=True)
-        ]
-        headings = [f"wheel {name}" if drive.direct else name for name in drive.names]
-        labels = [f"{row} ({unit})" for row, unit in _ROWS]
-        if len(headings) > _COLUMNS:
-            headings, labels, cells = labels, headings, [list(column) for column in zip(*cells, strict=True)]
-        rows = (page.Row.of(label, *row) for label, row in zip(labels, cells, strict=True))
-        return page.Table(
-            "", (page.Column("matrix", numeric=False), *map(page.Column, headings)), tuple(rows), self._kept
-        )
+    def elements(self, heading: str = "") -> page.Table:
+        """The elements of the matrix beside the design, with their intervals, as parameters are shown."""
+        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
+        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
+        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
+            low, high = row.get("low"), row.get("high")
+            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
+            values = (f"{row[name]:+.7f}" for name in ("design", "value"))
+            change = "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"
+            name = f"{'w' if row['row'] == 'heading' else row['row']}: {row['signal']}"
+            rows.append((name, *values, row["unit"], change, interval))
+        return _values_table(heading or self.heading, rows, self._kept)
 
     @property
     def _kept(self) -> str:
@@ -154,21 +144,6 @@ class CalibrationResult(Result):
         kept = () if self.run is None else self.run.kept
         motions = " and ".join(f"{each.words} ({each.motion})" for each in kept)
         return f"the design values are kept along {motions}, of which these data say nothing" if kept else ""
-
-    def _elements(self) -> page.Table:
-        """The elements of a matrix that has no reading as parameters, a row each, as parameters are shown."""
-        rows, design = [], self.calibration.robot.inverse_kinematic_matrix
-        shares = relative_deviations(self.calibration.matrix_array, design).ravel()
-        for row, share in zip(self._matrix().iter_rows(named=True), shares, strict=True):
-            low, high = row.get("low"), row.get("high")
-            interval = NOTHING if low is None else "by design" if low == high else f"{low:+.7f} to {high:+.7f}"
-            values = (f"{row[name]:+.7f}" for name in ("design", "value"))
-            rows.append(
-                page.Row.of(f"{row['row']}: {row['signal']}", *values, row["unit"], _deviation(float(share)), interval)
-            )
-        columns = (page.Column(name) for name in ("design", "value", "", "change", "95 %"))
-        heading = page.Column(self._heading, numeric=False)
-        return page.Table("", (heading, *columns), tuple(rows), self._kept)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         return {"matrix": self._matrix, "parameters": self._parameters}
@@ -191,18 +166,17 @@ class CalibrationResult(Result):
             columns["standard_deviation"] = np.sqrt(np.where(variances > 0, variances, np.nan))
         if self.run is not None and self.run.uncertainty is not None:
             columns |= {end: getattr(self.run.uncertainty.intervals, end) for end in ("low", "high")}
-        names = ("x", "y", "heading")
         named = {
-            "row": [name for name in names for _ in signals],
-            "signal": [*signals] * len(names),
-            "unit": [unit for _, unit in _ROWS for _ in signals],
+            "row": [row for row in _ROWS for _ in signals],
+            "signal": [*signals] * len(_ROWS),
+            "unit": [unit for unit in _ROWS.values() for _ in signals],
         }
         return pl.DataFrame(named | {name: each.ravel() for name, each in columns.items()}).fill_nan(None)
 
     def figure(self, dataset: Dataset | None = None) -> go.Figure:
-        """The parameters' changes from the design or, with a data set, paths of a few runs before and after."""
+        """The elements' differences from the design or, with a data set, paths of a few runs before and after."""
         if dataset is None:
-            return self._deviations()
+            return drawn(self.deviations())
         require_type(dataset, Dataset, "load_dataset")
         self.calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
         held_out = dataset.split("validation")
@@ -212,41 +186,46 @@ class CalibrationResult(Result):
             raise DataError(f"data set {dataset.name}: no run has a path of poses to draw")
         return drawn(grid)
 
-    def _deviations(self) -> go.Figure:
+    def deviations(self) -> page.FigureGrid:
         """Each element's difference from the design, in % of its row's scale, with its interval or its deviation."""
         frame = self._matrix()
         scales = np.repeat(self.calibration.robot.row_scales, len(self.calibration.robot.drive.names)) / 100
         value, deviation = frame["value"], frame["standard_deviation"]
-        bars, ends = "standard deviations", (value - deviation, value + deviation)
+        bars, (low, high) = "standard deviations", (value - deviation, value + deviation)
         if "low" in frame.columns:
-            bars, ends = "95 % intervals", (frame["low"], frame["high"])
-        names = [f"{row}: {signal}" for row, signal in zip(frame["row"], frame["signal"], strict=True)]
-        scaled = [((column - frame["design"]) / scales).to_list() for column in (value, *ends)]
+            bars, (low, high) = "95 % intervals", (frame["low"], frame["high"])
+        names = [text(f"{row}: {signal}") for row, signal in zip(frame["row"], frame["signal"], strict=True)]
+        ends = {"array": ((high - value) / scales).to_list(), "arrayminus": ((value - low) / scales).to_list()}
+        at, marker = ((value - frame["design"]) / scales).to_list(), {"color": CALIBRATED, "size": 9}
+        dots = go.Scatter(x=at, y=names, mode="markers", marker=marker, error_x={"type": "data", **ends})
+        figure = plot(dots, x_title="difference from the design, % of the row's scale")
+        figure.add_vline(x=0.0, line={"width": 1, "dash": "dot"})
+        figure.update_yaxes(autorange="reversed", automargin=True)
         title = f"{self.calibration.name}: elements of the matrix with {bars}"
-        grid = page.FigureGrid((_intervals(title, "difference from the design, % of the row's scale", names, *scaled),))
-        return drawn(grid)
+        height = 100 + 24 * len(names)
+        return page.FigureGrid(
+            (page.Figure(title, figure, f"{title}: {', '.join(names)}", height),), (), 1, "", "matrix"
+        )
 
 
+@dataclass(eq=False, repr=False)
 class EvaluationResult(Result):
     """An evaluation: errors on every split beside those of the design, and errors to expect on paths.
 
     evaluation: None where only paths were asked for. The other arguments are those of a calibration's result.
     """
 
-    def __init__(
-        self,
-        evaluation: Evaluation | None,
-        calibration: Calibration | None = None,
-        paths: Sequence[PathError] = (),
-        dataset: Dataset | None = None,
-        file: Path | None = None,
-        sources: Sequence[Path] = (),
-        warnings: Sequence[str] = (),
-    ) -> None:
-        self.evaluation, self.calibration, self.paths, self.dataset = evaluation, calibration, paths, dataset
-        self.file, self.sources, self.warnings = file, sources, warnings
-        if evaluation is not None:
-            self.title = f"Evaluation on {evaluation.dataset!r}, {plural(evaluation.trajectories, 'run')}"
+    evaluation: Evaluation | None
+    calibration: Calibration | None = None
+    paths: Sequence[PathError] = ()
+    dataset: Dataset | None = None
+    file: Path | None = None
+    sources: Sequence[Path] = ()
+    warnings: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.evaluation is not None:
+            self.title = f"Evaluation on {self.evaluation.dataset!r}, {plural(self.evaluation.trajectories, 'run')}"
 
     def sentence(self) -> str:
         return "" if self.evaluation is None else self.evaluation.held_out.sentence
@@ -305,7 +284,7 @@ class EvaluationResult(Result):
         """Mean position errors on every split, before and after."""
         frame = self._splits()
         bars = []
-        for model, item in (("design", DESIGN_ITEM), ("calibration", _CALIBRATED)):
+        for model, item in zip(_MODELS, (DESIGN_ITEM, _CALIBRATED), strict=True):
             rows = frame.filter(pl.col("model") == model)
             values = (1000 * rows["position_mean_m"].cast(pl.Float64)).to_list()
             bars.append(go.Bar(x=rows["split"].to_list(), y=values, name=model, marker_color=item.colour))
@@ -351,14 +330,6 @@ def verdict_remarks(verdict: HeldOutVerdict | None) -> list[Remark]:
     return [Remark(verdict.sentence, _TONES[verdict.verdict]), *([Remark(detail)] if detail else [])]
 
 
-def _physical(calibration: Calibration) -> Mapping[str, PhysicalParameter]:
-    """The physical parameters; none where no wheels near the design have the matrix."""
-    try:
-        return calibration.physical_parameters
-    except DataError:
-        return {}
-
-
 def _models(calibration: Calibration, dataset: Dataset) -> Models:
     """The design and the calibration."""
     design = OdometryModel.of_design(dataset.robot, calibration.integration)
@@ -366,7 +337,7 @@ def _models(calibration: Calibration, dataset: Dataset) -> Models:
 
 
 def calibration_document(
-    calibration: Calibration, dataset: Dataset, verdict: HeldOutVerdict, warnings: Sequence[str] = ()
+    found: Calibration | CalibrationRun, dataset: Dataset, verdict: HeldOutVerdict, warnings: Sequence[str] = ()
 ) -> page.Document:
     """The report of a calibration on the runs of a data set: on those that the verdict is of, or else on all.
 
@@ -374,35 +345,46 @@ def calibration_document(
     """
     judged = [run for run in dataset.trajectories if run.id in set(verdict.runs)]
     runs, which = (judged, "held-out") if judged else (list(dataset.trajectories), "recorded")
-    models = _models(calibration, dataset)
-    errors = [final_errors(model, runs) for _, model in models]
-    (before, turned_before), (after, turned_after) = map(positions_and_headings, errors)
+    shown = CalibrationResult(found)
+    calibration, models = shown.calibration, _models(shown.calibration, dataset)
+    errors = [ModelErrors.of(model, runs) for _, model in models]
+    groups = {"all": runs} | {kind: [runs[index] for index in like] for kind, like in kinds_of(runs).items()}
+    rows = tuple(page.Row.of(name, *_error_cells(errors, group)) for name, group in groups.items())
+    _, _, *means = (cell.text for cell in rows[0].cells)
     tiles = [
-        page.Fact("Position", f"{_mm(before)} → {_mm(after)}", "mean error of the final pose"),
-        page.Fact("Heading", f"{_degrees(turned_before)} → {_degrees(turned_after)}", "mean error of the final pose"),
+        page.Fact(what, f"{before} → {after}{unit}", "mean error of the final pose")
+        for what, before, after, unit in (("Position", *means[:2], " mm"), ("Heading", *means[2:], "°"))
+        if NOTHING not in (before, after)
     ]
     if verdict.improvement is not None:
         known = verdict.low is not None and verdict.high is not None
         interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
         tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
-    sections = []
-    if _physical(calibration):
-        blocks: tuple[page.Block, ...] = (parameter_table(calibration),)
-        if (figure := _changes(calibration)) is not None:
-            blocks = (page.FigureGrid((figure,), (_CALIBRATED,), 1, "", "parameters"), *blocks)
-        sections.append(page.Section("parameters", "Radii, lengths and angles", blocks))
-    by_motion = _by_motion(runs, errors)
-    about = f"Errors of the final pose of the {which} runs, by what the robot drove."
-    pictures = (_motion_figure(by_motion),) if len(runs) > len(by_motion) else ()  # a dot a motion is in the table
-    sections.append(page.Section("motions", "Errors by motion", (*pictures, _motion_table(by_motion)), about=about))
+    headings = (f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS)
+    of_motions = page.Table(
+        f"Mean errors of the final pose of the {which} runs", page.columns("motion", "runs", *headings), rows
+    )
+    sections = [page.Section("motions", "Errors by motion", (of_motions,))]
+    if shown.parameters:
+        sections.insert(0, page.Section("parameters", "Radii, lengths and angles", (parameter_table(calibration),)))
     if predicted := predicted_errors(calibration):
-        about = "Expected errors at the end, from the calibration's uncertainty and the slip that its runs showed."
-        title = "What to expect on other paths"
-        sections.append(page.Section("paths", title, (path_table(predicted, calibration),), about=about))
-    matrix = CalibrationResult(calibration).matrix_table()
-    sections.append(page.Section("matrix", "The matrix", (matrix,), about="What is computed."))
-    made = (_facts(calibration, verdict),)
-    sections.append(page.Section("origin", "How it was made", made, about="Data, fit, noise, versions."))
+        expected = (path_table(predicted, calibration),)
+        sections.append(page.Section("paths", "What to expect on other paths", expected))
+    origin = calibration.provenance
+    made = [("Verdict", typeset(verdict.sentence), typeset(verdict.detail))]
+    made += [("Effects", calibration.effects_in_words, "")] if calibration.effects else []
+    if calibration.noise is not None:
+        made.append(("Noise of the reference", "; ".join(noise_in_words(calibration.noise)), ""))
+    if origin is not None:
+        options, versions = (
+            ", ".join(f"{name} {value}" for name, value in each.items()) for each in (origin.options, origin.versions)
+        )
+        made += [
+            ("Fitted to", origin.dataset, f"hash {origin.dataset_hash}"),
+            ("Calibrator", origin.calibrator, options),
+            ("Outcome", origin.outcome, typeset(origin.reason)),
+            ("Versions", versions, ""),
+        ]
     return page.Document(
         title=f"Calibration of {dataset.robot.name}",
         subtitle=f"{calibration.name}, on {plural(len(runs), f'{which} run')} of {dataset.name}",
@@ -414,12 +396,22 @@ def calibration_document(
                 page.Callout("What these data leave open", tuple(map(typeset, warnings)), "warning"),
             ),
             *sections,
+            page.Section("matrix", "The matrix", (shown.deviations(), shown.elements("element"))),
+            page.Section("origin", "How it was made", (page.Facts(tuple(page.Fact(*each) for each in made)),)),
         ),
         badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
+def _error_cells(errors: Sequence[ModelErrors], runs: Sequence[Trajectory]) -> list[str]:
+    """Number of runs, and the means of their final errors by each model: positions, mm, then headings, degrees."""
+    both = [of_model.on(runs) for of_model in errors]
+    places = (significant(None if each.position_mean_m is None else 1e3 * each.position_mean_m) for each in both)
+    turns = (None if each.heading_mean_rad is None else math.degrees(each.heading_mean_rad) for each in both)
+    return [str(len(runs)), *places, *(fixed(turn, 2) for turn in turns)]
+
+
+def parameter_table(calibration: Calibration, title: str = "parameter") -> page.Table:
     """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
     rows = []
     for each in calibration.physical_parameters.values():
@@ -431,15 +423,15 @@ def parameter_table(calibration: Calibration, title: str = "") -> page.Table:
         ends = [] if each.low is None or each.high is None else [each.low, each.high]
         interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or NOTHING
         values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append(page.Row.of(each.name, *values, unit, change, interval))
-    headings = (
-        page.Column("design"),
-        page.Column("value"),
-        page.Column("", numeric=False),
-        page.Column("change"),
-        page.Column("95 %"),
-    )
-    return page.Table("", (page.Column(title or "parameter", numeric=False), *headings), tuple(rows))
+        rows.append((each.name, *values, unit, change, interval))
+    return _values_table(title, rows)
+
+
+def _values_table(heading: str, rows: Sequence[Sequence[str]], note: str = "") -> page.Table:
+    """Values beside the design: name, design, value, unit, change, interval."""
+    unit = page.Column("", numeric=False)
+    columns = page.columns(heading, "design", "value", unit, "change", "95 %")
+    return page.Table("", columns, tuple(page.Row.of(*row) for row in rows), note)
 
 
 def error_table(evaluation: Evaluation) -> page.Table:
@@ -454,19 +446,18 @@ def error_table(evaluation: Evaluation) -> page.Table:
             where += f", {({0: 'none', whole: 'all'}).get(part, f'{part:,}')} held out"
         if errors.outside is not None:
             where += f", {100 * errors.outside:.0f} % of the time outside of what it was fitted to"
+        rows.append(page.Row.of(where, role="group"))
         for label, each in (("calibration", errors), ("design", evaluation.design[split])):
             metres = (fixed(value, 4) for value in (each.position_mean_m, each.position_max_m))
             angles = (each.heading_mean_rad, each.heading_max_rad)
             degrees = (fixed(None if value is None else math.degrees(value), 2) for value in angles)
-            rows.append(page.Row.of(where, label, f"{each.cost:.4f}", *metres, *degrees))
-            where = ""
-    columns = (
-        page.Column("runs", numeric=False),
-        page.Column("model", numeric=False),
-        page.Column("Eq. (6)"),
-        *(page.Column(f"position, {which}", "m") for which in ("mean", "max")),
-        *(page.Column(f"heading, {which}", "deg") for which in ("mean", "max")),
+            rows.append(page.Row.of(label, f"{each.cost:.4f}", *metres, *degrees))
+    errors_of = (
+        f"{what}, {which} ({unit})"
+        for what, unit in (("position", "m"), ("heading", "deg"))
+        for which in ("mean", "max")
     )
+    columns = page.columns("model", "Eq. (6)", *errors_of)
     kind = " (simulated data)" if evaluation.simulated else ""
     note = f"fitted with the loss {evaluation.loss}; the errors are without it" if evaluation.loss else ""
     return page.Table(f"{evaluation.dataset}{kind}", columns, tuple(rows), note)
@@ -477,22 +468,16 @@ def reference_table(evaluation: Evaluation) -> page.Table:
     rows = []
     for split, errors in evaluation.splits.items():
         for fitted, before in zip(errors.references, evaluation.design[split].references, strict=True):
-            values = [value for at in (fitted, before) for value in (at.mean, at.max)]
             angle = fitted.unit == "rad"
-            sizes = (f"{math.degrees(value):.2f} deg" if angle else f"{1000 * value:.1f} mm" for value in values)
+            sizes = (
+                f"{math.degrees(value):.2f} deg" if angle else f"{1000 * value:.1f} mm"
+                for value in (fitted.mean, fitted.max, before.mean, before.max)
+            )
             ratios = (f"{fitted.in_sigmas:.1f}", f"{before.in_sigmas:.1f}")
             rows.append(page.Row.of(split, fitted.kind, str(fitted.references), *sizes, *ratios))
-    columns = (
-        page.Column("runs", numeric=False),
-        page.Column("reference", numeric=False),
-        page.Column("number"),
-        page.Column("mean"),
-        page.Column("largest", priority=1),
-        page.Column("design: mean"),
-        page.Column("largest", priority=1),
-        page.Column("in sigmas"),
-        page.Column("design: in sigmas", priority=1),
-    )
+    kind, largest = page.Column("reference", numeric=False), page.Column("largest", priority=1)
+    by_design = page.Column("design: in sigmas", priority=1)
+    columns = page.columns("runs", kind, "number", "mean", largest, "design: mean", largest, "in sigmas", by_design)
     note = "in sigmas: root mean square of errors in the references' own standard deviations, 1 if the model is right"
     return page.Table("errors by kind of reference", columns, tuple(rows), note)
 
@@ -502,14 +487,13 @@ def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Ta
     rows = []
     for path in dict.fromkeys(error.path for error in errors):
         by_model = {error.model: error for error in errors if error.path == path}
-        both = (by_model["design"], by_model["calibration"])
+        both = [by_model[model] for model in _MODELS]
         places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
         turns = (f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both)
         rows.append(page.Row.of(path, *places, *turns))
-    columns = (
-        page.Column("path", numeric=False),
-        *(page.Column(f"position, {model}", "mm") for model in ("design", "calibration")),
-        *(page.Column(f"heading, {model}", "deg") for model in ("design", "calibration")),
+    columns = page.columns(
+        "path",
+        *(f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS),
     )
     runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
     return page.Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows))
@@ -518,124 +502,3 @@ def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Ta
 def _figures(value: float) -> str:
     """A number with two figures, or all before its point."""
     return f"{value:.1f}" if value < 10 else f"{value:.0f}"
-
-
-def _mm(distances: Array) -> str:
-    return f"{significant(1e3 * float(distances.mean()))} mm"
-
-
-def _degrees(angles: Array) -> str:
-    return f"{fixed(math.degrees(float(angles.mean())), 2)}°"
-
-
-def _deviation(share: float) -> str:
-    return "design 0" if math.isnan(share) else f"{100 * share:+.2f} %"
-
-
-def _changes(calibration: Calibration) -> page.Figure | None:
-    """Each parameter's change from the design with its interval, lengths in %, angles in degrees; None without any."""
-    names, values = list[str](), list[list[float]]()
-    for each in calibration.physical_parameters.values():
-        share_of_design = each.unit == "m" and each.design
-        if each.low is None or each.high is None or not (each.unit == "rad" or share_of_design):
-            continue
-        scale = math.degrees(1.0) if each.unit == "rad" else 100 / abs(each.design)
-        names.append(f"{each.name} ({'°' if each.unit == 'rad' else '%'})")
-        values.append([scale * (value - each.design) for value in (each.value, each.low, each.high)])
-    title = "Change from the design, with 95 % intervals"
-    across = "change from the design: lengths in %, angles in degrees"
-    return _intervals(title, across, names, *map(list, zip(*values, strict=True))) if names else None
-
-
-def _intervals(title: str, across: str, names: list[str], values: Any, low: Any, high: Any) -> page.Figure:
-    """A dot with its interval for each name; values, low, high: numbers, or None."""
-    bars = [
-        [None if None in (a, b) else a - b for a, b in zip(*ends, strict=True)]
-        for ends in ((high, values), (values, low))
-    ]
-    error = {"type": "data", "array": bars[0], "arrayminus": bars[1]}
-    marker = {"color": CALIBRATED, "size": 9}
-    dots = go.Scatter(x=values, y=list(map(text, names)), mode="markers", marker=marker, error_x=error)
-    figure = plot(dots, x_title=across)
-    figure.add_vline(x=0.0, line={"width": 1, "dash": "dot"})
-    figure.update_yaxes(autorange="reversed", automargin=True)
-    return page.Figure(title, figure, f"{title}: {', '.join(names)}", 100 + 24 * len(names))
-
-
-def _by_motion(runs: Sequence[Trajectory], errors: Sequence[Array]) -> dict[str, list[Array]]:
-    """Final errors (n, 3) of the design and of the calibration, by what the robot drove."""
-    kinds = [_motion(run) for run in runs]
-    known = ("straight", "turning left", "turning right", "both ways", "on the spot")
-    names = [name for name in known if name in kinds]
-    return {name: [of_model[np.array(kinds) == name] for of_model in errors] for name in names}
-
-
-def _motion(run: Trajectory) -> str:
-    """The kind of motion of a run, by its reference; by its references alone, or the wheels, it is not looked at."""
-    steps = np.diff(run.poses, axis=0)
-    way, turn = float(np.hypot(*steps[:, :2].T).sum()), steps[:, 2]
-    turned = float(np.abs(turn).sum())
-    if turned < _TURNS:
-        return "straight"
-    if way < _ON_THE_SPOT * turned / (2 * math.pi):
-        return "on the spot"
-    left = float(turn[turn > 0].sum()) / turned
-    return "turning left" if left > 0.8 else "turning right" if left < 0.2 else "both ways"
-
-
-def _motion_figure(by_motion: dict[str, list[Array]]) -> page.FigureGrid:
-    """Every run's final error, position and heading, by motion: a dot each before and after."""
-    figures = []
-    for title, unit, index in (("Position error of the final pose", "mm", 0), ("Heading error", "degrees", 1)):
-        traces, names = [], list(by_motion)
-        for model, item in enumerate((DESIGN_ITEM, _CALIBRATED)):
-            x, y = list[float](), list[float]()
-            for number, of_kind in enumerate(by_motion.values()):
-                values = positions_and_headings(of_kind[model])[index]
-                scaled = 1e3 * values if index == 0 else np.degrees(values)
-                spread = np.linspace(-0.12, 0.12, len(scaled)) if len(scaled) > 1 else np.zeros(1)
-                x += (number + 0.32 * (model - 0.5) + spread).tolist()
-                y += scaled.tolist()
-            traces.append(marks(item, 6, np.array(x), np.array(y), hover=f"%{{y:.3g}} {unit}", marker_opacity=0.6))
-        figure = plot(*traces, y_title=unit)
-        figure.update_xaxes(tickvals=list(range(len(names))), ticktext=names, range=[-0.5, len(names) - 0.5])
-        figure.update_yaxes(rangemode="tozero")
-        figures.append(page.Figure(title, figure, f"{title} of every run, by motion, before and after", 320))
-    return page.FigureGrid(tuple(figures), (DESIGN_ITEM, _CALIBRATED), 2, "", "errors-by-motion")
-
-
-def _motion_table(by_motion: dict[str, list[Array]]) -> page.Table:
-    rows = []
-    for name, of_kind in by_motion.items():
-        both = [positions_and_headings(errors) for errors in of_kind]
-        rows.append(
-            page.Row.of(
-                name, str(len(of_kind[0])), *(_mm(each[0]) for each in both), *(_degrees(each[1]) for each in both)
-            )
-        )
-    columns = (
-        page.Column("motion", numeric=False),
-        page.Column("runs"),
-        *(page.Column(f"position, {which}") for which in ("design", "calibration")),
-        *(page.Column(f"heading, {which}") for which in ("design", "calibration")),
-    )
-    return page.Table("Mean errors of the final pose", columns, tuple(rows))
-
-
-def _facts(calibration: Calibration, verdict: HeldOutVerdict) -> page.Facts:
-    """Where the calibration comes from, and how to make it again."""
-    origin = calibration.provenance
-    facts = [page.Fact("Verdict", typeset(verdict.sentence), typeset(verdict.detail))]
-    if calibration.effects:
-        facts.append(page.Fact("Effects", calibration.effects_in_words))
-    if calibration.noise is not None:
-        facts.append(page.Fact("Noise of the reference", "; ".join(noise_in_words(calibration.noise))))
-    if origin is not None:
-        options = ", ".join(f"{name} {value}" for name, value in origin.options.items())
-        facts += [
-            page.Fact("Fitted to", origin.dataset, f"hash {origin.dataset_hash}"),
-            page.Fact("Calibrator", origin.calibrator, options),
-            page.Fact("Outcome", origin.outcome, typeset(origin.reason)),
-            page.Fact("Versions", ", ".join(f"{name} {version}" for name, version in origin.versions.items())),
-        ]
-    return page.Facts(tuple(facts))

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.numbers import fixed, plain
-from omnibench.report.style import INK, PALETTE, QUIET, THEORETICAL, plan, text
+from omnibench.report.style import INK, PALETTE, THEORETICAL, plan, text
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
 Values = Sequence[float] | Sequence[str] | Array  # numbers, or the names of categories
@@ -119,95 +119,73 @@ def is_drawn(robot: Robot) -> bool:
     return all(map(is_placed, robot.wheels))
 
 
-def motion_system(robot: Robot) -> tuple[Figure, list[LegendItem]]:
-    """Wheels with their rolling directions, the frame, and how a motion command (v, α, ω) is meant; the legend."""
-    size = _size(robot)
-    traces = [_outlines(DESIGN, robot)]
-    traces += arrows(_FRAME, np.zeros((2, 2)), _up(0.55 * size * np.eye(2)), ["X_R, front", "Y_R, left"])
-    middles = np.array([wheel.position for wheel in robot.measured])
-    ways = np.array([_unit_vector(wheel.rolling) for wheel in robot.measured])
-    starts = middles + 0.22 * size * np.array([_unit_vector(wheel.outward) for wheel in robot.measured])
-    words = [f"V_{wheel.name}: rate times radius" for wheel in robot.measured]
-    traces += arrows(_ROLLING, _up(starts - 0.18 * size * ways), _up(starts + 0.18 * size * ways), words)
+def motion_system(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) -> FigureGrid:
+    """A robot from above: wheels with their values and directions of rolling, its frame, a motion command (v, α, ω).
+
+    fitted: robots whose wheels are drawn over these. Fig. 2 and 3 of the paper.
+    """
+    size = max(math.hypot(*wheel.position) for wheel in robot.wheels)
+    traces = [_outlines(DESIGN, robot), *(_outlines(item, of_fit) for item, of_fit in fitted)]
     direction = math.radians(_DIRECTION)
-    tip = 0.62 * size * _unit_vector(direction)[None]
-    traces += arrows(_COMMAND, np.zeros((1, 2)), _up(tip), [f"α = {_DIRECTION}°"])
-    turning = _arc(0.3 * size, direction, direction + math.radians(80))
-    traces.append(line(_COMMAND, 1.6, *_up(turning).T))
-    traces += arrows(_COMMAND, _up(turning[-2:-1]), _up(turning[-1:]), ["ω"])
+    way, turns = _unit_vector(direction), _unit_vector(direction + np.linspace(0.0, math.radians(80), 40))
+    traces += arrows(_FRAME, np.zeros((2, 2)), _up(0.55 * size * np.eye(2)), ["X_R, front", "Y_R, left"])
+    traces += arrows(_COMMAND, np.zeros((1, 2)), _up(0.62 * size * way[None]), [f"α = {_DIRECTION}°"])
+    traces.append(line(_COMMAND, 1.6, *_up(0.3 * size * turns).T))
+    traces += arrows(_COMMAND, _up(0.3 * size * turns[-2:-1]), _up(0.3 * size * turns[-1:]), ["ω"])
     labels = [
         _label(size * np.array([0.56, -0.12]), "X<sub>R</sub>", INK),
         _label(size * np.array([0.13, 0.56]), "Y<sub>R</sub>", INK),
-        _label(1.22 * tip[0], "v, α", _COMMAND.colour),
-        _label(turning[-1] * 1.3, "ω", _COMMAND.colour),
+        _label(0.76 * size * way, "v, α", _COMMAND.colour),
+        _label(0.39 * size * turns[-1], "ω", _COMMAND.colour),
     ]
-    for wheel, start, way in zip(robot.measured, starts, ways, strict=True):
-        labels.append(_label(start + 0.36 * size * way, f"V<sub>{text(wheel.name)}</sub>", _ROLLING.colour))
+    rolling = []
+    for wheel in robot.measured:
+        way, name = _unit_vector(wheel.rolling), text(wheel.name)
+        start = np.array(wheel.position) + 0.22 * size * _unit_vector(wheel.outward)
+        rolling.append(_up(start + 0.18 * size * np.array([-way, way])))
+        labels.append(_label(start + 0.36 * size * way, f"V<sub>{name}</sub>", _ROLLING.colour))
+    begins, ends = np.array(rolling).transpose(1, 0, 2)
+    traces += arrows(_ROLLING, begins, ends, [f"V_{wheel.name}: rate times radius" for wheel in robot.measured])
     for wheel in robot.wheels:
-        behind = (wheel.radius + 0.1 * size) * _unit_vector(
-            wheel.rolling
-        )  # beside the rectangle, which names would cross
-        labels.append(_label(np.array(wheel.position) - behind, text(wheel.name), INK))
-    figure = _seen_from_above(traces, labels, size)
+        x, y = map(plain, wheel.position)
+        values = f"x {x} m<br>y {y} m"
+        if wheel.distance is not None:
+            degrees = fixed(math.degrees(wheel.axle % math.tau), 1)
+            values = f"R {wheel.distance:g} m<br>δ {degrees}°"
+        words = f"<b>{text(wheel.name)}</b> r {wheel.radius:g} m<br>{values}"
+        ahead, left = wheel.position
+        beside = np.sign(left) if abs(left) > 0.1 * size else 0.0  # values stand beside a wheel, or behind it
+        place = (ahead, left + 0.5 * size * beside) if beside else (ahead - 0.65 * size, left)
+        anchor = {1.0: "right", 0.0: "center", -1.0: "left"}[beside]
+        labels.append(_label(np.array(place), words, DESIGN.colour) | {"xanchor": anchor})
+    # The axes of the picture: x upwards, y to the left
+    window = _REACH * size * np.array([[-1.0, 1.0]] * 2)
+    figure = plan(*traces, window=window, x_title="y, to the left (m)", y_title="x, forward (m)")
+    step = 10.0 ** math.floor(math.log10(size))
+    most = math.floor(_REACH * size / step)
+    ticks = step * np.arange(-most, most + 1)
+    to_left = [fixed(-float(tick), max(0, -round(math.log10(step)))) for tick in ticks]
+    figure.update_layout(annotations=labels, yaxis_tickvals=ticks.tolist())
+    figure.update_xaxes(tickvals=ticks.tolist(), ticktext=to_left)
     names = ", ".join(wheel.name for wheel in robot.wheels)
     description = f"{robot.name} from above: wheels {names}, frame, directions of rolling"
-    return Figure("The motion system", figure, description, 460), [DESIGN, _FRAME, _ROLLING, _COMMAND]
+    items = (DESIGN, *(item for item, _ in fitted), _FRAME, _ROLLING, _COMMAND)
+    return FigureGrid((Figure("The motion system", figure, description, 460),), items, 1, name="robot")
 
 
-def parameters(robot: Robot, fitted: Sequence[tuple[LegendItem, Robot]] = ()) -> Figure:
-    """Radius and place of every wheel as designed; fitted: robots whose wheels are drawn over these."""
-    size = _size(robot)
-    traces, labels = [_outlines(DESIGN, robot, filled=True)], []
-    traces += [_outlines(item, of_fit) for item, of_fit in fitted]
-    traces += arrows(_FRAME, np.zeros((1, 2)), _up(np.array([[0.4 * size, 0.0]])), ["X_R, front"])
-    for number, wheel in enumerate(robot.wheels):
-        place, name = np.array(wheel.position), text(wheel.name)
-        traces.append(line(_FRAME, 1.2, *_up(np.array([[0.0, 0.0], place])).T, line_dash="dot"))
-        if wheel.distance is not None:
-            angle = wheel.axle % (2 * math.pi)
-            reach, before = (0.2 + 0.1 * number) * size, angle - 0.35  # rad before the arc's end: beside that line
-            traces.append(line(_FRAME, 1.0, *_up(_arc(reach, 0.0, angle)).T))
-            labels.append(_label((reach + 0.08 * size) * _unit_vector(before), f"δ<sub>{name}</sub>", QUIET))
-            labels.append(_label(0.6 * place + 0.1 * size * _unit_vector(wheel.rolling), f"R<sub>{name}</sub>", INK))
-            values, apart = (
-                f"r {wheel.radius:g} m<br>R {wheel.distance:g} m<br>δ {fixed(math.degrees(angle), 1)}°",
-                0.65,
-            )
-        else:
-            x, y = map(plain, wheel.position)
-            values, apart = f"r {wheel.radius:g} m<br>x {x} m<br>y {y} m", 0.5  # wheels to the sides: within the plot
-        labels.append(
-            _label(place + apart * size * _unit_vector(wheel.outward), f"<b>{name}</b> {values}", DESIGN.colour)
-        )
-    description = f"Radius and place of each wheel of {robot.name}"
-    return Figure("Its parameters", _seen_from_above(traces, labels, size), description, 460)
+def _unit_vector(angle: float | Array) -> Array:
+    """Unit vectors (..., 2) at angles (...) from the front, rad."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _unit_vector(angle: float) -> Array:
-    """Unit vector at an angle from the front, rad."""
-    return np.array([math.cos(angle), math.sin(angle)])
-
-
-def _size(robot: Robot) -> float:
-    """Distance of the farthest wheel, m."""
-    return max(math.hypot(*wheel.position) for wheel in robot.wheels)
-
-
-def _outlines(item: LegendItem, robot: Robot, filled: bool = False) -> go.Scatter:
+def _outlines(item: LegendItem, robot: Robot) -> go.Scatter:
     """The wheels as rectangles: their diameter along the direction of rolling; those that steer straight ahead."""
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]])
     rectangles = []
     for wheel in robot.wheels:
         sides = wheel.radius * np.array([_unit_vector(wheel.rolling), _WIDTH * _unit_vector(wheel.axle)])
         rectangles.append(_up(np.array(wheel.position) + corners @ sides))
-    looks: dict[str, Any] = {"fill": "toself", "fillcolor": "rgba(0,135,95,0.12)"} if filled else {}
-    return line(item, 2.0, *joined(rectangles).T, **looks)
-
-
-def _arc(radius: float, first: float, last: float) -> Array:
-    """Points (n, 2) of an arc about the centre between two angles, rad."""
-    angles = np.linspace(first, last, 40)
-    return radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return line(item, 2.0, *joined(rectangles).T)
 
 
 def _up(points: Array) -> Array:
@@ -218,19 +196,6 @@ def _up(points: Array) -> Array:
 def _label(point: Array, words: str, colour: str) -> dict[str, Any]:
     x, y = _up(point)
     return {"x": x, "y": y, "text": words, "showarrow": False, "font": {"color": colour, "size": 13}}
-
-
-def _seen_from_above(traces: Sequence[go.Scatter], labels: list[dict[str, Any]], size: float) -> go.Figure:
-    window = _REACH * size * np.array([[-1.0, 1.0]] * 2)
-    figure = plan(*traces, window=window, x_title="y, to the left (m)", y_title="x, forward (m)")
-    step = 10.0 ** math.floor(math.log10(size))
-    ticks = step * np.arange(-math.floor(_REACH * size / step), math.floor(_REACH * size / step) + 1)
-    axis = {
-        "tickvals": ticks.tolist(),
-        "ticktext": [fixed(-float(tick), max(0, -round(math.log10(step)))) for tick in ticks],
-    }
-    figure.update_layout(annotations=labels, xaxis=axis, yaxis_tickvals=ticks.tolist())
-    return figure
 
 
 _MARGIN = 60  # px above and below

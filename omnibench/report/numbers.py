@@ -81,12 +81,6 @@ def power_of_ten(exponent: int) -> str:
     return plain.get(exponent, f"10{str(exponent).translate(_SUPERSCRIPT)}")
 
 
-def round_down(value: float) -> float:
-    """The largest of 1, 2, 5, 10, 20, ... and of 0.5, 0.2, ... that does not exceed ``value``, which is > 0."""
-    decade = 10.0 ** math.floor(math.log10(value))
-    return max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9))
-
-
 def span(low: float, high: float, decimals: int, signed: bool = False) -> str:
     """An interval: ``low to high``."""
     return f"{fixed(low, decimals, signed)} to {fixed(high, decimals, signed)}"
@@ -104,16 +98,11 @@ def typeset(sentence: str) -> str:
 
 def noise_in_words(noise: Noise) -> tuple[str, str]:
     """The noise of positions and of headings in words, without components that are zero."""
-    kinds = (("white", ""), ("walk", "/√s"), ("bias of a run", ""))
-    position = (noise.pose_position, noise.walk_position, noise.bias_position)
-    heading = (noise.pose_heading, noise.walk_heading, noise.bias_heading)
     shown = []
-    for values, factor, unit in ((position, 1e3, " mm"), (heading, math.degrees(1.0), "°")):
-        parts = [
-            f"{kind} {significant(factor * value, 2)}{unit}{per}"
-            for (kind, per), value in zip(kinds, values, strict=True)
-            if value > 0
-        ]
+    for what, factor, unit in (("position", 1e3, " mm"), ("heading", math.degrees(1.0), "°")):
+        kinds = (("white", "pose", ""), ("walk", "walk", "/√s"), ("bias of a run", "bias", ""))
+        sizes = [(words, factor * getattr(noise, f"{kind}_{what}"), per) for words, kind, per in kinds]
+        parts = [f"{words} {significant(size, 2)}{unit}{per}" for words, size, per in sizes if size > 0]
         shown.append(", ".join(parts) or "none")
     return shown[0], shown[1]
 

@@ -12,12 +12,8 @@ from omnibench.data.dataset import Trajectory
 from omnibench.fit.evaluate import final_errors
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.figures import START, marks, path
-from omnibench.report.numbers import fixed
-from omnibench.report.recording.recording_figures import (
-    REFERENCE_ITEM,
-    evenly,
-    motion_titles,
-)
+from omnibench.report.numbers import fixed, motion_in_words
+from omnibench.report.recording.recording_figures import REFERENCE_ITEM, evenly
 from omnibench.report.style import INK, THEORETICAL, plan, text
 from omnibench.robot.kinematics import Array, rotated
 from omnibench.robot.model import OdometryModel
@@ -46,7 +42,8 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
     gains = np.linalg.norm(ends[0], axis=1) - np.linalg.norm(ends[-1], axis=1)
     seen = [index for index, run in enumerate(runs) if np.ptp(run.poses[:, :2], axis=0).max() > _LEAST_WINDOW]
     ordered = sorted(seen or range(len(runs)), key=lambda index: gains[index])
-    ((title, run),) = motion_titles([runs[ordered[(len(ordered) - 1) // 2]]]).items()
+    run = runs[ordered[(len(ordered) - 1) // 2]]
+    title = motion_in_words(run.id, run.v, run.alpha, run.omega)
     figures = (_path(f"{title[0].upper()}{title[1:]}", run, models), _all_ends(runs, ends, models, which))
     caption = "The run whose error falls by the median. Circle: start; dots: ends. In the titles: distance of the end "
     caption += "from the reference's, and turn between them, before and after."

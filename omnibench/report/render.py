@@ -39,7 +39,6 @@ from omnibench.report.blocks import (
 )
 from omnibench.words import plural
 
-_CARTESIAN = {"bar", "box", "contour", "heatmap", "histogram", "scatter", "violin"}  # traces that the bundle draws
 _PLOT_OPTIONS = {
     "responsive": True,
     "displaylogo": False,

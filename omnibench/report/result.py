@@ -7,12 +7,13 @@ find theirs through ``omnibench.views``. All of them show the same tables and fi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from shlex import join
 from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from omnibench.report.blocks import Column, Document, FigureGrid, Row, Section, Table, Tone, answer_section
+from omnibench.report.blocks import Column, Document, FigureGrid, Paragraph, Row, Table, Tone
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -72,10 +73,12 @@ class Result:
         return ()
 
     def document(self) -> Document:
-        """The whole report."""
-        pictures = self.figures()
-        more = Section("tables", "In numbers", tuple(self.tables()))
-        return Document(self.title, "", (answer_section(self.sentence(), (), *pictures[:1] or (None,)), more))
+        """The whole report, without what to do next."""
+        raise NotImplementedError
+
+    def page(self) -> Document:
+        """The whole report; its answer says what to do next."""
+        return with_next_step(self.document(), self.next_step())
 
     def json(self) -> Mapping[str, Any] | BaseModel:
         """The document of ``--json``."""
@@ -90,6 +93,15 @@ class Result:
         from omnibench.report.figures import drawn
 
         return drawn(self.figures()[0])
+
+
+def with_next_step(document: Document, step: NextStep) -> Document:
+    """A report whose first section says, below its sentence, what to do next."""
+    answer, *others = document.sections
+    first, *rest = answer.blocks
+    typed = f": {join(map(str, step.command))}" if step.command else "."
+    following = [Paragraph(f"Next, {step.then}{typed}")] if step.then else []
+    return replace(document, sections=(replace(answer, blocks=(first, *following, *rest)), *others))
 
 
 def frame_table(frame: pl.DataFrame) -> Table:

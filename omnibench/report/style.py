@@ -27,32 +27,12 @@ THEORETICAL = "#00875f"
 
 # Palettes of Okabe and Ito and of Tol for colour-blind readers, without the red and the green above.
 PALETTE = (
-    "#0072b2",
-    "#e69f00",
-    "#aa3377",
-    "#4fb0e8",
-    "#7b4b2a",
-    "#332288",
-    "#8f8f1f",
-    "#8a8f98",
-    "#cc79a7",
-    "#111111",
-    "#9970ab",
-    "#b8977e",
+    *("#0072b2", "#e69f00", "#aa3377", "#4fb0e8", "#7b4b2a", "#332288"),
+    *("#8f8f1f", "#8a8f98", "#cc79a7", "#111111", "#9970ab", "#b8977e"),
 )
 DASHES: tuple[Dash, ...] = ("solid", "dot", "dashdot")
-SYMBOLS = (
-    "circle-open",
-    "square-open",
-    "diamond-open",
-    "triangle-up-open",
-    "triangle-down-open",
-    "pentagon-open",
-    "star-open",
-    "hexagon-open",
-    "cross-open",
-    "x-open",
-)
+_SHAPES = ("circle", "square", "diamond", "triangle-up", "triangle-down", "pentagon", "star", "hexagon", "cross", "x")
+SYMBOLS = tuple(f"{shape}-open" for shape in _SHAPES)
 
 # Spans that a middle is away from 0 before its axis begins elsewhere: a tick then has three digits more than one near
 # 0 (chosen).

@@ -62,7 +62,7 @@ def test_evaluate_shows_the_design_values_and_how_many_runs_were_held_out(comman
     shown = command("evaluate", prepared.calibration, prepared.data).stdout
     assert "(simulated data)" in shown
     for split in ("train: 6 runs, none held out", "validation: 6 runs, all held out"):
-        assert re.search(rf"^{split} +calibration", shown, re.MULTILINE)
+        assert re.search(rf"^{split}\ncalibration ", shown, re.MULTILINE)
     assert len(shown.splitlines()) <= 25
 
 

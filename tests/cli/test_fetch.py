@@ -142,16 +142,14 @@ def test_another_commit_is_checked_out_in_it(command: Command, github: GitHub, o
     assert commit in command("fetch", "diff", "--force", "--commit", commit[:10]).stdout
 
 
-def test_a_clone_from_elsewhere_needs_no_network(command: Command, github: GitHub, optiodom: str) -> None:
+@pytest.mark.parametrize("depth", [(), ("--depth", "1")])
+def test_a_clone_from_elsewhere_needs_no_network_unless_it_lacks_its_history(
+    command: Command, github: GitHub, optiodom: str, depth: tuple[str, ...]
+) -> None:
     CLONE.parent.mkdir(parents=True)
-    github.git(Path(), "clone", "-q", f"https://github.com/{OPTIODOM}", CLONE)
-    shutil.rmtree(github.folder)
-    assert optiodom in command("fetch", "diff").stdout
-
-
-def test_a_clone_without_its_history_is_completed(command: Command, github: GitHub, optiodom: str) -> None:
-    CLONE.parent.mkdir(parents=True)
-    github.git(Path(), "clone", "-q", "--depth", "1", f"https://github.com/{OPTIODOM}", CLONE)
+    github.git(Path(), "clone", "-q", *depth, f"https://github.com/{OPTIODOM}", CLONE)
+    if not depth:
+        shutil.rmtree(github.folder)
     assert optiodom in command("fetch", "diff").stdout
 
 

@@ -112,7 +112,7 @@ def test_the_poses_are_those_of_the_truth_and_the_rest_is_as_it_was(found: Found
     count = sum(len(before.scans.times(run.id)) for run in before.trajectories)
     assert "driven, simulated data: reference poses from the scans" in found.run.stdout
     assert f"3 runs, {count} scans; " in found.run.stdout
-    assert "distance from the recorded reference (12 poses)" in " ".join(found.run.stdout.split())
+    assert re.search(r"^poses +– +12 *$", found.run.stdout, re.MULTILINE)  # that are compared with the recorded ones
     assert "truth" not in found.run.stdout
     # A busy machine is told every 10 s how far it is; the last sentence has two lines.
     assert all(line.startswith("SLAM: ") for line in found.run.stderr.splitlines()[:-2])
@@ -171,7 +171,7 @@ def test_the_truth_gives_errors_bias_and_drift_and_a_report(command: Command, dr
     )
     assert run.returncode == 0, run.stderr
     assert "Errors of the reference poses against the truth" in run.stdout
-    for row in ("position (mm)", "heading (°)", "forward, signed (mm)", "to the left, signed (mm)", "NEES"):
+    for row in ("position mean (mm)", "heading p95 (°)", "bias forward (mm)", "bias left (mm)", "nees mean"):
         assert re.search(rf"^{re.escape(row)} +[−+\d]", run.stdout, re.MULTILINE)
     assert re.search(r"3 runs, [23]\.\d+ m in all; drift \S+ mm", run.stdout)
     assert "SIMULATED DATA" in Path("slam.html").read_text(encoding="utf-8")
@@ -299,7 +299,8 @@ def test_ctrl_c_before_the_first_path_leaves_nothing(driven: Driven, tmp_path: P
 
 def test_inspect_says_what_scans_there_are(command: Command, driven: Driven) -> None:
     run = command("inspect", driven.data)
-    assert "540 rays over 270° up to 30 m, 100% measured; in 3 runs" in run.stdout
+    assert "540 ranges over 270°, to 30 m" in run.stdout
+    assert "scans: 100% of the rays measured" in run.stdout
     document = json.loads(command("inspect", driven.data, "--json").stdout)["scans"]
     scans = load_dataset(driven.data).scans
     assert document["scans"] == sum(len(scans.times(name)) for name in scans.trajectories)
@@ -471,7 +472,7 @@ def many_notes() -> Discovery:
 
 
 DRIVE = ("acceleration_slip", "turning left on the spot at 1 rad/s 12.5 4", "Drive 4 runs, 1.8 minutes")
-LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "warning: not driven in training: v0.4_a90_w1", "experiment-1.yaml")
+LEFT_OVER = ("wheel rate (2 × 10⁻¹¹)", "v0.4_a90_w1 turns at 1.0 rad/s", "experiment-1.yaml")
 SHOWN: dict[Callable[[], Discovery], tuple[str, ...]] = {
     named: ("(simulated data): 36 training runs", "verdict: named", "held-out session: 36 runs", "now/model.yaml"),
     nameless: ("verdict: unknown",),

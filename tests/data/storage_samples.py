@@ -90,7 +90,8 @@ def set_cell(name: str, row: int, column: str, value: Any) -> Change:
     def change(folder: Path) -> None:
         frame = read_frame(folder, name)
         values = frame[column].to_list()
-        values[row - 1] = value
+        as_text = isinstance(value, list) and frame[column].dtype == pl.String
+        values[row - 1] = " ".join(map(str, value)) if as_text else value
         typed = pl.Series(column, [str(v) for v in values] if isinstance(value, str) else values)
         write_frame(folder, name, frame.with_columns(typed))
 

@@ -5,15 +5,26 @@ import random
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 import yaml
 from commands import refused
-from storage_samples import FORMATS, Format, everything_known, read_frame, table_file, write_frame
+from storage_samples import (
+    FORMATS,
+    Change,
+    Format,
+    everything_known,
+    read_frame,
+    rename,
+    set_cell,
+    table_file,
+    with_frame,
+    write_frame,
+)
 
 from omnibench.data.dataset import Dataset
 from omnibench.data.scans import Mount, Scanner, ScansInMemory, ScansOnDisk, TrajectoryScans
@@ -165,25 +176,11 @@ def test_a_full_disk_is_told_in_one_line(tmp_path: Path) -> None:
         save_dataset(scanned(), tmp_path / "data")
 
 
-def with_cell(row: int, column: str, value: Any) -> Callable[[pl.DataFrame], pl.DataFrame]:
-    """Another value in a row, counted from 1; in CSV and in Parquet."""
-
-    def change(frame: pl.DataFrame) -> pl.DataFrame:
-        values = frame[column].to_list()
-        as_text = frame[column].dtype == pl.String
-        values[row - 1] = " ".join(map(str, value)) if as_text and isinstance(value, list) else value
-        if not as_text and isinstance(value, str):
-            values = list(map(str, values))
-        return frame.with_columns(pl.Series(column, values))
-
-    return change
-
-
 RANGES = [1.0] * 7
-Change = Callable[[pl.DataFrame], pl.DataFrame]
+with_cell, edited = partial(set_cell, "scans"), partial(with_frame, "scans")
 BROKEN: list[tuple[Change, str]] = [
-    (lambda frame: frame.rename({"ranges": "range"}), r"column 'ranges' is missing; did you mean 'range'"),
-    (lambda frame: frame.clear(), "it has no rows"),
+    (rename("scans", "ranges", "range"), r"column 'ranges' is missing; did you mean 'range'"),
+    (edited(lambda frame: frame.clear()), "it has no rows"),
     (with_cell(2, "t", None), "row 2: t is missing"),
     (with_cell(2, "t", math.nan), "row 2: t is (nan|NaN)"),
     (with_cell(2, "t", "soon"), "row 2: t is 'soon'"),
@@ -200,7 +197,7 @@ BROKEN: list[tuple[Change, str]] = [
     (with_cell(6, "ranges", [math.inf] * 6 + [0.01]), r"row 6: the scan of trajectory run-2 at 0\.15 s is empty"),
     (with_cell(6, "ranges", [1234.0] * 6 + [math.inf]), r"row 6: .* is empty: .*; they look like mm"),
 ]
-BROKEN_PARQUET: list[tuple[Change, str]] = [
+BROKEN_PARQUET: list[tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = [
     (lambda frame: frame.with_columns(ranges=pl.lit("1 2 3 4 five 6 7")), "row 1: ranges must be numbers"),
     (lambda frame: frame.with_columns(ranges=pl.lit(3.0)), "column 'ranges' holds Float64, expected lists"),
     (lambda frame: frame.with_columns(ranges=pl.col("ranges").cast(pl.List(pl.String))), "column 'ranges' holds"),
@@ -213,11 +210,14 @@ BROKEN_PARQUET: list[tuple[Change, str]] = [
 
 @pytest.mark.parametrize(
     ("fmt", "change", "message"),
-    [*((fmt, *case) for case in BROKEN for fmt in FORMATS), *(("parquet", *case) for case in BROKEN_PARQUET)],
+    [
+        *((fmt, *case) for case in BROKEN for fmt in FORMATS),
+        *(("parquet", edited(edit), words) for edit, words in BROKEN_PARQUET),
+    ],
 )
 def test_a_broken_table_is_refused_in_one_line(tmp_path: Path, fmt: Format, change: Change, message: str) -> None:
     save_dataset(scanned(), tmp_path, fmt)
-    write_frame(tmp_path, "scans", change(read_frame(tmp_path, "scans")))
+    change(tmp_path)
     with refused(DataError, match=rf"scans\.\w+[:,] {message}"):
         list(scans_of(tmp_path))
 

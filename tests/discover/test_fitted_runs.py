@@ -41,10 +41,10 @@ from omnibench.discover import fitting
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments import Choice, Members, Separation, candidate_runs, choose_runs, description_of
 from omnibench.discover.regressors.fine_structure import fine_structure
-from omnibench.discover.regressors.paths import slopes_by
+from omnibench.discover.regressors.paths import slopes_by, slopes_by_delay
 from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
-from omnibench.discover.report.residuals import EXTENDED, NORMAL_95, PLAIN, Residuals, shares
-from omnibench.discover.report.where_section import motor_grid
+from omnibench.discover.report.figures import motor_grid
+from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
 from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
 from omnibench.fit.noise import Whitener
 from omnibench.fit.trajectory_fit import Whitened, usable_runs
@@ -53,7 +53,6 @@ from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import ActuatorEffect, make_term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
-from omnibench.robot.odometry import WheelLog
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import read_simulation, simulate_dataset
 
@@ -235,24 +234,19 @@ def test_an_eccentric_wheel_shows_its_amplitude_before_and_nothing_after(eccentr
     columns = np.column_stack([rate * np.cos(angle), rate * np.sin(angle)])
     fitted = eccentric.fit(eccentric.paths.of_wheel(0, columns))
     values, errors = fitted.values, fitted.errors  # (2, before and after)
-    noise = errors[0, EXTENDED.index]
-    assert 0.012 < values[0, PLAIN.index] < 0.022  # some of 0.02 is in the matrix, and in the start headings
-    assert abs(values[1, PLAIN.index]) < 4 * errors[1, PLAIN.index]
-    assert np.abs(values[:, EXTENDED.index]).max() < 4 * noise
+    noise = errors[0, 1]
+    assert 0.012 < values[0, 0] < 0.022  # some of 0.02 is in the matrix, and in the start headings
+    assert abs(values[1, 0]) < 4 * errors[1, 0]
+    assert np.abs(values[:, 1]).max() < 4 * noise
 
 
 def test_a_late_reference_shows_its_delay_in_every_run(eccentric: Residuals) -> None:
     paths = eccentric.paths
-
-    def seen(log: WheelLog, path: np.ndarray, later: float) -> np.ndarray:
-        return np.column_stack([np.interp(log.stamps + later, [0, *log.times], axis) for axis in path.T])
-
-    ways = zip(paths.logs, paths.ends, strict=True)
-    velocity = np.concatenate([(seen(log, path, 0.05) - seen(log, path, -0.05)) / 0.1 for log, path in ways])
-    fitted = eccentric.fit_runs(-velocity[:, :, None])
-    assert (fitted.values[:, PLAIN.index] > 0).mean() > 0.9
-    assert np.median(fitted.values[:, PLAIN.index]) > 0.01  # of 0.06: the matrix takes up much
-    assert abs(np.median(fitted.values[:, EXTENDED.index])) < 0.005
+    of_run = shares(paths.run.astype(float), np.arange(len(eccentric.runs) + 1.0))
+    before, after = eccentric.fit(slopes_by_delay(paths) * of_run[:, None, :]).values.T
+    assert (before > 0).mean() > 0.9
+    assert np.median(before) > 0.01  # of 0.06: the matrix takes up much
+    assert abs(np.median(after)) < 0.005
 
 
 def test_noise_leaves_the_bands_once_in_twenty_times() -> None:
@@ -280,7 +274,6 @@ def test_residuals_are_as_seen_from_the_start_wherever_that_is() -> None:
     before = tuple(in_room(turn, own) - turn for turn, own in zip(turns, found.before, strict=True))
     here, there = Residuals(found).commands, Residuals(replace(found, dataset=dataset, before=before)).commands
     for one, other in zip(here, there, strict=True):
-        np.testing.assert_allclose(other.end, one.end, atol=1e-9)
         np.testing.assert_allclose(other.means[0], one.means[0], atol=1e-9)
 
 
@@ -337,7 +330,7 @@ def test_errors_of_the_motion_are_recovered_from_the_residuals_that_they_make(va
         before=tuple(made[part] for part in here.paths.parts),
     )
     fitted = Residuals(found).fit(columns)
-    np.testing.assert_allclose(fitted.values[:, PLAIN.index], values, atol=1e-9)
+    np.testing.assert_allclose(fitted.values[:, 0], values, atol=1e-9)
 
 
 # All that odometry or reference have, in any robot; a slope of tyre_wear needs the name of a session.

@@ -77,17 +77,8 @@ def standing(errors: Array, sigma: float = 0.0) -> list[Trajectory]:
     runs = []
     for number, of_run in enumerate(errors):
         measured = [Reference("turn", float(error), sigma, float(t)) for error, t in zip(of_run, times, strict=False)]
-        runs.append(
-            Trajectory(
-                str(number),
-                "train",
-                times,
-                np.zeros((10, 2)),
-                np.zeros(1),
-                poses,
-                references=References.of(measured, 1.0),
-            )
-        )
+        given = References.of(measured, 1.0)
+        runs.append(Trajectory(str(number), "train", times, np.zeros((10, 2)), np.zeros(1), poses, references=given))
     return runs
 
 
@@ -98,12 +89,9 @@ def excess_of(errors: Array, sigma: float) -> float:
     return excess
 
 
-def test_errors_beyond_what_measures_them_are_the_excess_by_runs_less_one() -> None:
+def test_errors_beyond_what_measures_them_alone_are_the_excess_by_runs_less_one() -> None:
     expected = np.sqrt(np.square(SPREAD).sum() / 5 - 0.01**2)
     assert excess_of(SPREAD[:, None], 0.01) == pytest.approx(expected, rel=1e-9)
-
-
-def test_errors_within_what_measures_them_have_no_excess() -> None:
     assert excess_of(SPREAD[:, None], 0.1) == 0.0
 
 

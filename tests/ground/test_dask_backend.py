@@ -10,20 +10,19 @@ import weakref
 from collections.abc import Iterator
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from commands import ENVIRONMENT, Command, assert_refused, python, refused, write_config
 from dask_samples import certificates, refusal
 from job_samples import Answer, Notes, jobs_of, run, squared, tried
-from test_jobs import EveryBackend, asleep, killed, killed_once, many_small_objects, with_jobs_of_its_own
+from test_jobs import EveryBackend, EveryProcess
 from timing import PATIENCE, until
 
 from omnibench.errors import ConfigError
 from omnibench.jobs.backend_choice import BackendChoice, check_backend, open_backend
 from omnibench.jobs.dask_backend import DaskBackend
-from omnibench.jobs.job import Failure, Job, ResultStore, TlsFiles, gathered, run_jobs
+from omnibench.jobs.job import Job, ResultStore, TlsFiles, gathered, run_jobs
 from omnibench.jobs.job_process import Packer
 from omnibench.progress import Progress, Reporter
 
@@ -38,40 +37,12 @@ def dask() -> Iterator[DaskBackend]:
         yield backend
 
 
-class TestDask(EveryBackend):
+class TestDask(EveryBackend, EveryProcess):
     ahead = 3  # one for each worker, and the next
 
     @pytest.fixture
     def backend(self, dask: DaskBackend) -> DaskBackend:
         return dask
-
-
-def test_a_job_has_one_thread(dask: DaskBackend, tmp_path: Path) -> None:
-    (answer,) = run(tmp_path, jobs_of(squared, [3]), dask).endings.values()
-    assert answer.threads == "1"
-
-
-def test_limits_hold_on_workers(dask: DaskBackend, tmp_path: Path) -> None:
-    jobs = [Job("time", asleep, 0, seconds=1.0), Job("memory", many_small_objects, tmp_path, memory_mb=400)]
-    notes = run(tmp_path, jobs, dask)
-    assert notes.endings[0] == Failure("over time (limit 1 s)", over_time=True)
-    assert notes.reason(1) == "out of memory (limit 400 MB)"
-    assert (tmp_path / "many_small_objects").stat().st_size == 1
-
-
-def test_within_a_job_there_are_no_further_processes(dask: DaskBackend, tmp_path: Path) -> None:
-    (answer,) = run(tmp_path, jobs_of(with_jobs_of_its_own, [tmp_path]), dask).endings.values()
-    assert (answer.number, str(answer.process)) == (3, answer.threads)
-
-
-def many_numbers(_: object, __: Reporter) -> list[float]:
-    return np.linspace(0, 1, 50_000).tolist()
-
-
-def test_a_result_too_large_for_an_event_arrives(dask: DaskBackend, tmp_path: Path) -> None:
-    store: ResultStore[Any] = ResultStore(tmp_path, list[float])
-    run_jobs([Job(f"large-{number}", many_numbers, number) for number in range(2)], store, dask, Notes())
-    assert [len(store.get(f"large-{number}") or ()) for number in range(2)] == [50_000] * 2
 
 
 def of_size(size: int, _: Reporter) -> bytes:
@@ -85,7 +56,7 @@ def trims_memory(_: int, __: Reporter) -> bool:
 
 def test_results_of_one_parcel_arrive_whatever_their_sizes_and_memory_is_not_trimmed(dask: DaskBackend) -> None:
     assert gathered(dask, trims_memory, [0]) == [False]
-    sizes = [10] * 40 + [10, 300_000] * 20
+    sizes = [10] * 40 + [10, 1_000_000] * 20
     assert [len(result) for result in gathered(dask, of_size, sizes)] == sizes
 
 
@@ -114,30 +85,22 @@ def test_data_that_jobs_share_are_pickled_once_and_go_with_none_of_them(dask: Da
     jobs = [Job(f"job-{number}", total, (number, data), shared=(data,)) for number in range(30)]
     assert run(tmp_path, jobs, dask).answers() == {number: 1_000_000 + number for number in range(30)}
     packer = Packer()
-    assert max(len(packer.pack(job).content) for job in jobs) < 200
-    assert len(packer.shared) == 1
+    packed = [packer.pack(job) for job in jobs]
+    assert max(len(job.content) for job in packed) < 200
+    assert len({id(content) for job in packed for content in job.shared.values()}) == 1
 
 
 @pytest.mark.slow
-class TestWorkersThatDie:
-    def test_a_job_whose_process_is_killed_is_tried_three_times(self, dask: DaskBackend, tmp_path: Path) -> None:
-        jobs = [Job("always", killed, (tmp_path, signal.SIGKILL)), Job("once", killed_once, tmp_path)]
-        notes = run(tmp_path / "results", jobs, dask)
-        assert notes.reason(0).endswith("in each of 3 tries")
-        assert (tmp_path / "killed").stat().st_size == 3
-        assert notes.answers()[1] == 2
-
-    def test_a_worker_that_is_killed_loses_nothing(self, dask: DaskBackend, tmp_path: Path) -> None:
-        jobs = [Job("always", kills_its_worker, (tmp_path, 9)), Job("once", kills_its_worker, (tmp_path / "once", 1))]
-        (tmp_path / "once").mkdir()
-        notes = Notes()
-        run_jobs(
-            [*jobs, *jobs_of(squared, range(20))], ResultStore(tmp_path / "results", Answer), dask, notes
-        )  # without a look at processes that are left: workers are started again
-        assert notes.reason(0).startswith("its worker tls://127.0.0.1:")
-        assert notes.reason(0).endswith(" was killed in each of 3 tries")
-        assert (tmp_path / "kills").stat().st_size == 3
-        assert [notes.answers()[number] for number in range(1, 22)] == [2, *(number**2 for number in range(20))]
+def test_a_worker_that_is_killed_loses_nothing(dask: DaskBackend, tmp_path: Path) -> None:
+    jobs = [Job("always", kills_its_worker, (tmp_path, 9)), Job("once", kills_its_worker, (tmp_path / "once", 1))]
+    (tmp_path / "once").mkdir()
+    notes, store = Notes(), ResultStore(tmp_path / "results", Answer)
+    # Without a look at processes that are left: workers are started again.
+    run_jobs([*jobs, *jobs_of(squared, range(20))], store, dask, notes)
+    assert notes.reason(0).startswith("its worker tls://127.0.0.1:")
+    assert notes.reason(0).endswith(" was killed in each of 3 tries")
+    assert (tmp_path / "kills").stat().st_size == 3
+    assert [notes.answers()[number] for number in range(1, 22)] == [2, *(number**2 for number in range(20))]
 
 
 def kills_its_worker(order: tuple[Path, int], _: Reporter) -> Answer:

@@ -179,8 +179,57 @@ class EveryBackend:
         assert "OPENBLAS_NUM_THREADS" not in os.environ
 
 
+class EveryProcess:
+    """What every backend promises whose jobs have processes of their own."""
+
+    @pytest.mark.parametrize("by", [signal.SIGKILL, *slow(signal.SIGTERM, signal.SIGHUP)])
+    def test_tries_a_job_that_is_killed_three_times(self, by: signal.Signals, backend: Backend, tmp_path: Path) -> None:
+        jobs = [Job("always", killed, (tmp_path, by)), Job("once", killed_once, tmp_path), Job("other", squared, 3)]
+        notes = run(tmp_path / "results", jobs, backend)
+        # Of other tests' processes some are killed for lack of memory, which the system counts for all.
+        reason = notes.reason().replace(": the system was out of memory", "")
+        assert reason == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
+        assert (tmp_path / "killed").stat().st_size == 3
+        assert (notes.answers()[1], notes.answers()[2]) == (2, 9)
+
+    def test_names_how_a_process_ended_and_does_not_try_its_job_again(self, backend: Backend, tmp_path: Path) -> None:
+        jobs = [*jobs_of(ended_with, [0, 3]), Job("crash", crashed, tmp_path)]
+        notes = run(tmp_path / "results", jobs, backend)
+        assert [notes.reason(code) for code in range(3)] == [
+            f"the process died without an answer ({how})" for how in ("exit code 0", "exit code 3", "killed by SIGABRT")
+        ]
+        assert (tmp_path / "crashed").stat().st_size == 1
+
+    def test_ends_a_job_over_its_memory_and_does_not_try_it_again(self, backend: Backend, tmp_path: Path) -> None:
+        works = (one_large_array, many_small_objects, little_memory)
+        notes = run(
+            tmp_path / "results", [Job(work.__name__, work, tmp_path, memory_mb=400) for work in works], backend
+        )
+        assert {notes.reason(0), notes.reason(1)} == {"out of memory (limit 400 MB)"}
+        assert notes.endings[2] == Answer(10**6)
+        assert {(tmp_path / work.__name__).stat().st_size for work in works[:2]} == {1}
+
+    def test_ends_a_job_over_its_time_and_does_not_try_it_again(self, backend: Backend, tmp_path: Path) -> None:
+        jobs = [Job(work.__name__, work, None, seconds=1.0) for work in (asleep, deaf)]
+        notes = run(tmp_path, [*jobs, Job("other", squared, 2)], backend)
+        over_time = Failure("over time (limit 1 s)", over_time=True)
+        assert (notes.endings[0], notes.endings[1]) == (over_time, over_time)
+        assert sorted(notes.began_numbers) == [0, 1, 2]
+
+    def test_has_one_thread_and_no_further_processes_within_a_job(self, backend: Backend, tmp_path: Path) -> None:
+        jobs = [Job("inner", with_jobs_of_its_own, tmp_path), Job("other", squared, 2)]
+        notes = run(tmp_path / "results", jobs, backend)
+        assert (notes.endings[0].number, str(notes.endings[0].process)) == (3, notes.endings[0].threads)  # its own
+        assert notes.endings[1].threads == "1"
+
+
 @pytest.mark.parametrize("backend", [InPlace(), Processes(2)], ids=("in place", "processes"))
 class TestLocalBackends(EveryBackend):
+    """Without Dask."""
+
+
+@pytest.mark.parametrize("backend", [Processes(2)], ids=["processes"])
+class TestProcesses(EveryProcess):
     """Without Dask."""
 
 
@@ -229,59 +278,6 @@ def test_a_job_with_a_limit_has_a_process_of_one_thread_for_itself(limit: str, t
 def test_jobs_without_limits_share_processes_and_one_worker_needs_none(tmp_path: Path) -> None:
     assert processes_of(run(tmp_path / "here", jobs_of(squared, [3]), local_backend(1))) == [os.getpid()]
     assert len(set(processes_of(run(tmp_path, jobs_of(squared, range(9)), Processes(2))))) <= 2
-
-
-@pytest.mark.parametrize("by", [signal.SIGKILL, *slow(signal.SIGTERM, signal.SIGHUP)])
-def test_a_job_that_is_killed_is_tried_three_times(by: signal.Signals, tmp_path: Path) -> None:
-    jobs = [*jobs_of(killed, [(tmp_path, by)]), Job("other", squared, 3)]
-    notes = run(tmp_path / "results", jobs, Processes(2))
-    # Of other tests' processes some are killed for lack of memory, which the system counts for all.
-    reason = notes.reason().replace(": the system was out of memory", "")
-    assert reason == f"the process died without an answer (killed by {by.name}) in each of 3 tries"
-    assert (tmp_path / "killed").stat().st_size == 3
-    assert notes.endings[1] == ResultStore(tmp_path / "results", Answer).get("other")
-
-
-def test_a_job_that_is_killed_once_has_a_result(tmp_path: Path) -> None:
-    assert run(tmp_path / "once", jobs_of(killed_once, [tmp_path]), Processes(1)).answers() == {0: 2}
-
-
-def test_a_job_that_ends_its_process_is_named_with_the_exit_code(tmp_path: Path) -> None:
-    notes = run(tmp_path, jobs_of(ended_with, [0, 3]), Processes(1))
-    assert "(exit code 0)" in notes.reason(0)
-    assert "(exit code 3)" in notes.reason(1)
-
-
-def test_a_job_that_crashes_is_not_tried_again(tmp_path: Path) -> None:
-    notes = run(tmp_path / "results", jobs_of(crashed, [tmp_path]), Processes(1))
-    assert notes.reason() == "the process died without an answer (killed by SIGABRT)"
-    assert (tmp_path / "crashed").stat().st_size == 1
-
-
-def test_a_job_over_its_memory_is_ended_and_not_tried_again(tmp_path: Path) -> None:
-    jobs = [
-        Job("one", one_large_array, tmp_path, memory_mb=400),
-        Job("many", many_small_objects, tmp_path, memory_mb=400),
-        Job("little", little_memory, tmp_path, memory_mb=400),
-    ]
-    notes = run(tmp_path / "results", jobs, Processes(2))
-    assert {notes.reason(0), notes.reason(1)} == {"out of memory (limit 400 MB)"}
-    assert notes.endings[2] == Answer(10**6)
-    assert {(tmp_path / name).stat().st_size for name in ("one_large_array", "many_small_objects")} == {1}
-
-
-def test_a_job_over_its_time_is_ended_and_not_tried_again(tmp_path: Path) -> None:
-    jobs = [Job(work.__name__, work, None, seconds=1.0) for work in (asleep, deaf)]
-    notes = run(tmp_path, [*jobs, Job("other", squared, 2)], Processes(3))
-    over_time = Failure("over time (limit 1 s)", over_time=True)
-    assert (notes.endings[0], notes.endings[1]) == (over_time, over_time)
-    assert sorted(notes.began_numbers) == [0, 1, 2]
-
-
-def test_within_a_job_there_are_no_further_processes(tmp_path: Path) -> None:
-    (answer,) = run(tmp_path, jobs_of(with_jobs_of_its_own, [tmp_path]), Processes(2)).endings.values()
-    assert answer.number == 3
-    assert str(answer.process) == answer.threads  # its own
 
 
 def test_whatever_the_watch_raises_ends_the_workers(tmp_path: Path) -> None:

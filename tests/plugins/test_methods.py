@@ -245,13 +245,10 @@ def test_four_mecanum_wheels_keep_the_design_where_no_path_drives_them(shares: l
     assert mean_errors(result.matrix, runs) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
-def test_runs_without_reference_poses_are_refused() -> None:
+def test_runs_without_reference_poses_and_the_geometry_are_refused() -> None:
     robot = synthetic_robot()
     blind = [replace(run, pose_times=run.pose_times[:1], poses=run.poses[:1]) for run in synthetic_trajectories(robot)]
     assert fit("lin", robot, blind).outcome is Outcome.NOT_APPLICABLE
-
-
-def test_the_geometry_is_refused() -> None:
     result = solved("lin", synthetic_problem("geometry"))
     assert (result.outcome, "parameterisation: matrix" in result.reason) == (Outcome.FAILED, True)
 

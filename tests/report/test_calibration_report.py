@@ -1,5 +1,6 @@
 """The page of ``calibrate --report`` and ``evaluate --report``."""
 
+import re
 from pathlib import Path
 
 from commands import assert_refused, run_here, succeeded
@@ -34,10 +35,13 @@ def test_the_report_answers_first_and_shows_paths_parameters_and_errors_by_motio
     assert document.badges[0].text in text  # simulated data are called so
 
 
-def test_calibrate_and_evaluate_write_a_page_and_do_not_overwrite_one(tmp_path: Path) -> None:
+def test_calibrate_and_evaluate_write_a_page_that_says_what_to_do_and_do_not_overwrite_one(tmp_path: Path) -> None:
     save_dataset(synthetic_dataset(), tmp_path / "data")
     succeeded(run_here("calibrate", "data", "-o", "c.yaml", "--report", "first.html", cwd=tmp_path))
-    succeeded(run_here("evaluate", "c.yaml", "data", "--report", "second.html", cwd=tmp_path))
+    ending = succeeded(run_here("evaluate", "c.yaml", "data", "--report", "second.html", cwd=tmp_path)).stderr
+    what_to_do = ending.partition("; next, ")[2].replace(":\n  ", ": ").strip()
     for page_file in ("first.html", "second.html"):
-        assert "Radii, lengths and angles" in (tmp_path / page_file).read_text()
+        written = re.sub("<[^>]+>", "", (tmp_path / page_file).read_text())
+        assert "Radii, lengths and angles" in written
+        assert f"Next, {what_to_do}" in written
     assert_refused(run_here("evaluate", "c.yaml", "data", "--report", "second.html", cwd=tmp_path), "second.html")

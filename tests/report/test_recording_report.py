@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from recording_samples import COMMANDS, NOISE, PERIOD, TICK, Sample, sample
 from report_page import Page
 from sample_robots import DIFFERENTIAL
-from syrupy.assertion import SnapshotAssertion
 from wheeled_samples import ROBOTS, driven
 
 from omnibench.data.dataset import Dataset, Trajectory
@@ -30,7 +29,6 @@ from omnibench.report.recording.recording_figures import (
     all_runs,
     representative_runs,
     scan_points,
-    thinned,
     wheel_rates,
 )
 from omnibench.report.recording.section import has_recording, player, recording_document, recording_section
@@ -39,7 +37,7 @@ from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_dataset import run_errors, slam_accuracy
 
-CONTENTS = "What was recorded"
+CONTENTS = "in a room, robot APR-02: simulated data"
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +47,7 @@ def made() -> Sample:
 
 @pytest.fixture(scope="module")
 def report(made: Sample, tmp_path_factory: pytest.TempPathFactory) -> Page:
-    known = {"truth": made.truth, "plan": made.plan, "starts": made.starts, "notes": ("Made for a test.",)}
+    known = {"truth": made.truth, "plan": made.plan, "starts": made.starts}
     return page(made.dataset, tmp_path_factory.mktemp("recording"), **known)
 
 
@@ -72,14 +70,18 @@ def bare(dataset: Dataset) -> Dataset:
     return replace(dataset, trajectories=runs, scans=None)
 
 
-def test_the_report_reads_as_before(report: Page, snapshot: SnapshotAssertion) -> None:
-    assert report.words() == snapshot
+def test_the_report_answers_first_then_tells_errors_runs_and_what_was_recorded(report: Page) -> None:
+    assert report.sections == ["answer", "slam", "player", "wheels", "recorded"]
+    assert list(report.tables) == ["Errors of the reference poses against the truth", CONTENTS]
+    assert report.text.count("floor plan (truth)") == 1
+    assert report.plots == 2 + 2 + 4 + 1  # the last is the player
 
 
 def test_every_link_of_table_1_has_its_number_and_rate(made: Sample, report: Page) -> None:
     samples = f"{sum(len(run.times) for run in made.dataset.trajectories):,} samples"
     scans = sum(len(run.pose_times) for run in made.dataset.trajectories)
     assert report.row(CONTENTS, "Measured wheel rates")[1:3] == [samples, "10.0 ms"]
+    assert report.row(CONTENTS, "Measured wheel rates")[3].startswith("a, b, c; by encoders")
     assert f"{TICK:.3f} rad/s" in report.row(CONTENTS, "Measured wheel rates")[3]
     assert report.row(CONTENTS, "LIDAR scans")[1] == f"{scans} scans"
     median, low, high = map(float, re.findall(r"\d+", report.row(CONTENTS, "LIDAR scans")[2]))
@@ -91,13 +93,12 @@ def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
     for name in ("Motion command", "Target wheel rates", "Wheel angles", "LIDAR scans"):
         assert told.row(CONTENTS, name)[1] == "not recorded"
     assert told.row(CONTENTS, "Reference poses")[3] == "without covariances"
-    assert told.row(CONTENTS, "Reference poses")[0].endswith("(x, y, θ)")  # no LIDAR made them
+    assert told.row(CONTENTS, "Reference poses")[0].endswith("x, y, θ")  # no LIDAR made them
     assert {"wheels", "player"} <= set(told.sections)
     assert all(run["scans"] == [] and run["targets"] is None for run in played(told).values())
 
 
-def test_notes_and_warnings_are_told(made: Sample, report: Page, tmp_path: Path) -> None:
-    assert "Made for a test." in report.text
+def test_warnings_are_told(made: Sample, tmp_path: Path) -> None:
     told = page(replace(made.dataset, warnings=("something odd",), simulated=False), tmp_path).text
     assert "something odd" in told
     assert "SIMULATED" not in told
@@ -154,10 +155,10 @@ def test_rates_of_the_player_are_the_mean_over_the_100_ms_before(made: Sample, r
 def test_errors_against_the_truth_are_those_of_the_accuracy(made: Sample, report: Page) -> None:
     accuracy = slam_accuracy(made.dataset, made.truth)
     caption = "Errors of the reference poses against the truth"
-    positions, headings, nees = (report.row(caption, name) for name in ("position (mm)", "heading (°)", "NEES"))
-    assert float(positions[4]) == pytest.approx(1e3 * accuracy.every.position_mean_m, rel=0.05)
-    assert float(headings[4]) == pytest.approx(math.degrees(accuracy.every.heading_mean_rad), rel=0.05)
-    assert 2 < float(nees[4]) < 4
+    told = {row[0]: row[2] for row in report.tables[caption]}
+    assert float(told["position mean (mm)"]) == pytest.approx(1e3 * accuracy.every.position_mean_m, rel=0.05)
+    assert float(told["heading mean (°)"]) == pytest.approx(math.degrees(accuracy.every.heading_mean_rad), rel=0.05)
+    assert 2 < float(told["nees mean"]) < 4
 
 
 def test_a_recording_without_truth_has_no_errors(made: Sample, tmp_path: Path) -> None:
@@ -169,7 +170,7 @@ def test_a_recording_without_truth_has_no_errors(made: Sample, tmp_path: Path) -
 @pytest.mark.parametrize("with_accuracy", [False, True])
 def test_the_truth_of_other_runs_is_one_line(made: Sample, tmp_path: Path, with_accuracy: bool) -> None:
     accuracy = slam_accuracy(made.dataset, made.truth) if with_accuracy else None
-    with pytest.raises(DataError, match="run straight-0 is not in the truth"):
+    with pytest.raises(DataError, match="straight-0 is not in the truth"):
         page(made.dataset, tmp_path, truth={"another": made.truth["left-0"]}, accuracy=accuracy)
 
 
@@ -195,10 +196,9 @@ def test_long_runs_with_many_scans_stay_below_two_megabytes(tmp_path: Path) -> N
 def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Sample) -> None:
     assert has_recording(made.dataset)
     assert not has_recording(bare(made.dataset))
-    section = recording_section(made.dataset)
-    assert section.key == "recording"
-    parts = ("paths", "player", "wheels")
-    assert [part.key for part in section.sections] == [f"recording-{part}" for part in parts]
+    pictures, contents = recording_section(made.dataset).blocks
+    assert len(pictures.figures) == 2
+    assert contents.caption == CONTENTS
 
 
 def hostile(run: Trajectory) -> Trajectory:
@@ -257,9 +257,9 @@ def test_singular_covariances_of_a_foreign_recording_are_left_out_of_the_nees(ma
     none = [replace(run, pose_covariances=np.zeros((len(run.poses), 3, 3))) for run in made.dataset.trajectories]
     caption = "Errors of the reference poses against the truth"
     told = page(replace(made.dataset, trajectories=tuple(none)), tmp_path, truth=made.truth)
-    assert told.row(caption, "NEES")[4] == "–"
+    assert told.row(caption, "nees mean")[2] == "–"
     some = replace(made.dataset, trajectories=(none[0], *made.dataset.trajectories[1:]))
-    assert 2 < float(page(some, tmp_path, truth=made.truth).row(caption, "NEES")[4]) < 4
+    assert 2 < float(page(some, tmp_path, truth=made.truth).row(caption, "nees mean")[2]) < 4
 
 
 @pytest.mark.slow
@@ -279,7 +279,7 @@ def test_a_run_with_a_start_pose_alone_is_drawn_all_the_same(made: Sample, tmp_p
 
 
 def test_of_each_kind_the_run_of_median_odometry_error_is_shown() -> None:
-    runs = sample(repetitions=3, duration=1.0).dataset
+    runs = sample(repetitions=3, duration=1.5).dataset
     wrong = {"left-0": 0.5, "left-1": 0.3, "left-2": -0.4}  # m that the reference is moved by at the end
     moved = [
         replace(run, poses=run.poses + np.outer(run.pose_times == run.pose_times[-1], [wrong.get(run.id, 0), 0, 0]))
@@ -336,13 +336,6 @@ def test_rays_that_saw_nothing_make_no_points(made: Sample) -> None:
     assert len(scan_points(run, scans.scanner, TrajectoryScans(found.times, ranges), 0)) == 45
 
 
-def test_thinning_keeps_points_far_apart_and_below_the_limit() -> None:
-    points = np.random.default_rng(1).uniform(0, 1, (5000, 2))
-    kept = thinned(points, 300)
-    assert 150 < len(kept) <= 300
-    assert {tuple(point) for point in kept} <= {tuple(point) for point in points}
-
-
 def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
     run = made.dataset.trajectories[0]
     figure = wheel_rates(run, made.dataset.robot).figures[0].plot
@@ -354,9 +347,7 @@ def test_the_mean_over_100_ms_is_that_of_the_samples(made: Sample) -> None:
 def test_the_error_is_measured_minus_target(made: Sample) -> None:
     run = made.dataset.trajectories[0]
     slow = replace(run, rates=np.asarray(run.targets) - 0.25)
-    _, error = wheel_rates(slow, made.dataset.robot).figures
-    assert error.title == "Measured − target: mean −0.25, RMS 0.25 rad/s"
-    assert all(np.allclose(trace.y, -0.25) for trace in error.plot.data)
+    assert wheel_rates(slow, made.dataset.robot).caption == "Measured − target: mean −0.25, RMS 0.25 rad/s."
 
 
 def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample) -> None:
@@ -373,7 +364,7 @@ def test_errors_do_not_depend_on_where_the_reference_has_its_origin(made: Sample
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_measured_rates_and_steering_angles_have_a_row_each(robot: Robot) -> None:
     run = driven(robot, runs=1, samples=20).trajectories[0]
-    plots = [figure.plot for figure in wheel_rates(run, robot).figures if not figure.title.startswith("Measured")]
+    plots = [figure.plot for figure in wheel_rates(run, robot).figures]
     titles = [axis.title.text for plot in plots for axis in plot.select_yaxes()]
     assert titles == [f"{name} (rad/s)" for name in robot.wheel_names] + [f"{name} (°)" for name in robot.drive.steered]
     steering = [trace.y for plot in plots for trace in plot.data if trace.legendgroup == "steering"]
@@ -447,28 +438,28 @@ OMNI = sample().dataset.robot
     ],
 )
 def test_a_motion_is_known_by_its_direction_and_turn(twist: tuple[float, float, float], kinds: set[str]) -> None:
-    found = inspection_report.driven_motions(driving(OMNI, twist), OMNI)
-    assert {motion.name for motion in found if motion.driven} == kinds
-    assert all(motion.share in (0.0, 1.0) for motion in found)
+    shares = shares_of_motions(driving(OMNI, twist), OMNI)
+    assert {name for name, share in shares.items() if share != "not driven"} == kinds
+    assert set(shares.values()) <= {"100 %", "not driven"}
+
+
+def shares_of_motions(runs: list[Trajectory], robot: Robot) -> dict[str, str]:
+    """The share of the time of each kind of motion, as the table tells it."""
+    return {row.cells[0].text: row.cells[1].text for row in inspection_report.motion_table(runs, robot).rows}
 
 
 def test_time_at_rest_is_no_motion() -> None:
-    found = inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
-    shares = {motion.name: motion.share for motion in found}
-    assert shares["straight"] == pytest.approx(0.5) == shares["on the spot to the left"]
-    assert "×" not in repr(inspection_report.motion_table(found).rows)  # a speed that is rounding is zero
-    on_two_wheels = inspection_report.driven_motions(driving(DIFFERENTIAL, (0.2, 0.0, 0.0)), DIFFERENTIAL)
-    assert not [motion for motion in on_two_wheels if motion.name.startswith("sideways")]
-
-
-def test_motions_that_are_missing_on_both_sides_are_named_once() -> None:
-    missing = inspection_report.missing_in_words(inspection_report.driven_motions(driving(OMNI, (0.2, 0.0, 0.0)), OMNI))
-    assert missing == "in curves to the left, in curves to the right, on the spot, backward or sideways"
+    shares = shares_of_motions(driving(OMNI, (0.2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), OMNI)
+    assert shares["straight"] == "50 %" == shares["on the spot to the left"]
+    on_two_wheels = shares_of_motions(driving(DIFFERENTIAL, (0.2, 0.0, 0.0)), DIFFERENTIAL)
+    assert not [name for name in on_two_wheels if name.startswith("sideways")]
 
 
 def inspected(dataset: Dataset, folder: Path) -> Path:
     """The file of the report of an inspection."""
-    write_document(inspection_report.inspection_document(dataset, inspect_dataset(dataset)), folder / "report.html")
+    write_document(
+        inspection_report.InspectionResult(inspect_dataset(dataset), dataset).document(), folder / "report.html"
+    )
     return folder / "report.html"
 
 
@@ -482,8 +473,10 @@ def inspection(inspection_file: Path) -> Page:
     return Page(inspection_file.read_text(encoding="utf-8"))
 
 
-def test_the_report_of_an_inspection_reads_as_before(inspection: Page, snapshot: SnapshotAssertion) -> None:
-    assert inspection.words() == snapshot
+def test_the_report_of_an_inspection_answers_first_and_tells_what_was_driven(inspection: Page) -> None:
+    assert inspection.sections == ["answer", "motions", "identified", "player", "wheels", "recorded"]
+    assert "Not driven to train: on the spot to the right, backward, sideways to the left" in inspection.text
+    assert {"Motions driven", CONTENTS} <= set(inspection.tables)
 
 
 def test_every_parameter_has_its_precision(made: Sample, inspection: Page) -> None:
@@ -502,5 +495,5 @@ def test_runs_that_are_all_alike_leave_motions_open(made: Sample, tmp_path: Path
     only = [replace(run, split="train") for run in made.dataset.trajectories if run.command == "straight"]
     few = replace(made.dataset, trajectories=tuple(only), scans=None)
     told = Page(inspected(few, tmp_path).read_text(encoding="utf-8"))
-    assert "Not driven to train: in curves to the left" in told.text
+    assert "Not driven to train: curves to the left" in told.text
     assert "Part of the matrix stays open" in told.text

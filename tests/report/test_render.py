@@ -328,11 +328,6 @@ def test_powers_of_ten_are_set_as_such() -> None:
     assert [numbers.power_of_ten(exponent) for exponent in (-10, -1, 0, 3, 4)] == ["10⁻¹⁰", "0.1", "1", "1,000", "10⁴"]
 
 
-@pytest.mark.parametrize(("value", "step"), [(7.3, 5), (5.0, 5), (1.0, 1), (0.37, 0.2), (99.0, 50)])
-def test_enlargements_are_round(value: float, step: float) -> None:
-    assert numbers.round_down(value) == pytest.approx(step)
-
-
 # Figures as files: their names, their number, and one clear line where nothing can draw them.
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from named_constants import Constant, constants_of
+from results_file import ResultsFile
 
 from omnibench.config import Model
 from omnibench.processes import one_thread
@@ -153,14 +154,10 @@ def carry_out(parts: Mapping[str, Part], description: str | None) -> None:
     parser.add_argument("--only", action="append", default=[], metavar="PART", help="of a constant's name")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = [Result.model_validate_json(line) for line in lines]
+    file = ResultsFile(arguments.out, Result)
     if not arguments.table:
-        done = {(each.part, each.constant, each.factor) for each in results}
-        with arguments.out.open("a") as file:
-            for name in arguments.part:
-                for result in study(name, parts[name], arguments.only, done):
-                    file.write(result.model_dump_json() + "\n")
-                    file.flush()
-                    results.append(result)
-    print_table([each for each in results if each.part in arguments.part])
+        done = {(each.part, each.constant, each.factor) for each in file.results}
+        for name in arguments.part:
+            for result in study(name, parts[name], arguments.only, done):
+                file.add(result)
+    print_table([each for each in file.results if each.part in arguments.part])

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from hidden.sets import Kind, make_set
 from named_constants import Constant, constants_of, modules_of
+from results_file import ResultsFile
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset
@@ -234,17 +235,13 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=len(SETS), help="how many sets, the first ones")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = [Result.model_validate_json(line) for line in lines]
+    file = ResultsFile(arguments.out, Result)
     if not arguments.table:
         varied = [each for each in constants() if not arguments.only or any(p in each.title for p in arguments.only)]
-        with arguments.out.open("a") as file:
-            for one in SETS[: arguments.sets]:
-                for result in study(one, varied, {each.key for each in results}):
-                    file.write(result.model_dump_json() + "\n")
-                    file.flush()
-                    results.append(result)
-    print_table(results)
+        for one in SETS[: arguments.sets]:
+            for result in study(one, varied, {each.key for each in file.results}):
+                file.add(result)
+    print_table(file.results)
 
 
 if __name__ == "__main__":

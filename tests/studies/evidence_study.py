@@ -24,6 +24,7 @@ from hidden.forms import FORMS
 from hidden.outside import OUTSIDE
 from hidden.pairs import PAIRS
 from hidden.sets import LEVELS, FormName, Kind, make_set
+from results_file import ResultsFile
 
 from omnibench.config import Model
 from omnibench.discover.fitting import extend, fit_matrix
@@ -190,17 +191,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    results = [Result.model_validate_json(line) for line in lines]
-    done = {result.key for result in results}
+    file = ResultsFile(arguments.out, Result)
+    done = {result.key for result in file.results}
     if not arguments.table:
-        with arguments.out.open("a") as file, one_thread():
+        with one_thread():
             for each in sets(range(FIRST_SEED, FIRST_SEED + arguments.seeds)):
                 if each not in done:
-                    results.append(measured(*each))
-                    file.write(results[-1].model_dump_json() + "\n")
-                    file.flush()
-    print_table(results)
+                    file.add(measured(*each))
+    print_table(file.results)
 
 
 if __name__ == "__main__":

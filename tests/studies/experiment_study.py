@@ -22,6 +22,7 @@ import numpy as np
 from hidden.forms import FORMS
 from hidden.further import joined, proposed_runs, recorded_again
 from hidden.sets import make_set
+from results_file import ResultsFile
 from scipy.stats import binomtest
 
 import omnibench.discover.discover as discovering
@@ -78,17 +79,15 @@ class Result(Model):
 def main() -> None:
     """Make the sets that are missing, then print the table."""
     arguments = _arguments()
-    results = _read(arguments.out)
+    file = ResultsFile(arguments.out, Result)
     if not arguments.table:
-        done = {each.key for each in results}
+        done = {each.key for each in file.results}
         sets = _omni3(arguments, done) if arguments.omni3 else _hidden(arguments, done)
-        with arguments.out.open("a") as file, one_thread():
+        with one_thread():
             for result in sets:
-                file.write(result.model_dump_json() + "\n")
-                file.flush()
-                results.append(result)
+                file.add(result)
                 print(result, flush=True)
-    print_table(results)
+    print_table(file.results)
 
 
 def hidden_set(name: str, level: float, seed: int, key: str = "", form: str = "blind") -> Result:
@@ -231,12 +230,6 @@ def _hidden(arguments: argparse.Namespace, done: set[str]) -> Iterator[Result]:
 def _omni3(arguments: argparse.Namespace, done: set[str]) -> Iterator[Result]:
     dataset = import_dataset("optiodom", arguments.omni3)
     yield from omni3_sets(dataset, range(arguments.first_seed, arguments.first_seed + arguments.seeds), done)
-
-
-def _read(path: Path) -> list[Result]:
-    if not path.exists():
-        return []
-    return [Result.model_validate_json(line) for line in path.read_text().splitlines() if line.endswith("}")]
 
 
 def _arguments() -> argparse.Namespace:

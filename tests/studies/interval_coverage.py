@@ -27,23 +27,21 @@ the heading.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from results_file import ResultsFile, in_processes
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.fitting import extend, fit_matrix
 from omnibench.discover.regressors.significance import Group
 from omnibench.fit.trajectory_fit import usable_runs
-from omnibench.processes import one_thread
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel
 
@@ -192,25 +190,6 @@ def cases(only: Sequence[str] = ()) -> list[Case]:
     return [case for case in every if not only or any(text in str(case) for text in only)]
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The rows of a file, none if it is not there; a last line that was cut off is left out."""
-    lines = path.read_text().split("\n")[:-1] if path.exists() else []
-    return [Row(**json.loads(line)) for line in lines]
-
-
-def carry_out(missing: Sequence[tuple[Case, int]], path: Path, jobs: int) -> Iterator[Row]:
-    """Fit sets and add each row to the file at once."""
-    written = path.read_bytes() if path.exists() else b""
-    with path.open("wb") as file:
-        file.write(written[: written.rfind(b"\n") + 1])
-    with one_thread(), ProcessPoolExecutor(jobs) as pool, path.open("a") as file:
-        for done in as_completed([pool.submit(covered, case, seed) for case, seed in missing]):
-            row = done.result()
-            file.write(json.dumps(asdict(row)) + "\n")
-            file.flush()
-            yield row
-
-
 def table(rows: Iterable[Row], chosen: Iterable[Case]) -> Iterator[str]:
     """A line for every cell: coverage with its 95 % interval (Wilson), each set counted as one trial."""
     rows = list(rows)
@@ -241,13 +220,14 @@ def main() -> None:
     parser.add_argument("--only", action="append", default=[], help="part of a cell's name; may be given several times")
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
-    chosen, rows = cases(arguments.only), read_rows(arguments.out)
+    chosen, file = cases(arguments.only), ResultsFile(arguments.out, Row)
     if not arguments.table:
-        done = {(row.case, row.seed) for row in rows}
+        done = {(row.case, row.seed) for row in file.results}
         wanted = [(case, seed) for seed in range(arguments.sets) for case in chosen]
         missing = [(case, seed) for case, seed in wanted if (str(case), seed) not in done]
-        rows += carry_out(missing, arguments.out, arguments.jobs)
-    print("\n".join(table(rows, chosen)))
+        for row in in_processes(covered, missing, arguments.jobs):
+            file.add(row)
+    print("\n".join(table(file.results, chosen)))
 
 
 if __name__ == "__main__":

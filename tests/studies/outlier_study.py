@@ -14,15 +14,15 @@ JSON a set, added as it comes: run again with the same file, and it goes on wher
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from interval_coverage import arc
+from results_file import ResultsFile, in_processes
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -32,7 +32,7 @@ from omnibench.discover.regressors.significance import Group
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
-from omnibench.robot.kinematics import Array, Robot, Wheel
+from omnibench.robot.kinematics import Robot, Wheel
 
 EFFECT = "direction_dependent_radius"
 TRUTH = np.array([0.006, -0.004, 0.008])  # half the relative difference between both directions, of each wheel
@@ -92,14 +92,6 @@ def simulated(seed: int) -> Dataset:
     return make_dataset("directions", Robot(name="omni3", wheels=wheels), float(TIMES[0]), tuple(runs), simulated=True)
 
 
-def arc(twist: Array, times: Array) -> Array:
-    """Poses (K, 3) of a robot that drives with a constant twist (m/s, m/s, rad/s) from the origin, in closed form."""
-    forward, left, turn = twist
-    chord = (np.exp(1j * turn * times) - 1) / (1j * turn) if turn else times
-    path = (forward + 1j * left) * chord
-    return np.column_stack([path.real, path.imag, turn * times])
-
-
 def fitted(seed: int, whole: bool) -> Row:
     """The estimates of one set."""
     dataset, began = simulated(seed), time.perf_counter()
@@ -155,17 +147,13 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
-    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
-    rows = [Row(**json.loads(line)) for line in lines]
+    file = ResultsFile(arguments.out, Row)
     tasks = [(seed, False) for seed in range(arguments.sets)] + [(seed, True) for seed in range(arguments.whole)]
-    done = {(row.seed, row.whole) for row in rows}
+    done = {(row.seed, row.whole) for row in file.results}
     missing = [] if arguments.table else [task for task in tasks if task not in done]
-    with ProcessPoolExecutor(arguments.jobs) as pool, arguments.out.open("a") as file:
-        for future in as_completed([pool.submit(fitted, *task) for task in missing]):
-            rows.append(future.result())
-            file.write(json.dumps(asdict(rows[-1])) + "\n")
-            file.flush()
-    print("\n".join(table(rows)))
+    for row in in_processes(fitted, missing, arguments.jobs):
+        file.add(row)
+    print("\n".join(table(file.results)))
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT / "tests")]
 
 from corelli import corelli_dataset  # noqa: E402
 from real_recordings import OPTIODOM, ROBOTINO  # noqa: E402
+from results_file import ResultsFile  # noqa: E402
 
 from omnibench.config import Model  # noqa: E402
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset  # noqa: E402
@@ -85,27 +86,13 @@ def main() -> None:
     parser.add_argument("--no-unknown-term", action="store_true", help="add no term without a name")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
-    rows = _read(arguments.out)
+    file = ResultsFile(arguments.out, Row)
     if not arguments.table:
-        with arguments.out.open("a") as file:
-            for row in _carried_out(
-                arguments.only, {row.key for row in rows}, unknown_term=not arguments.no_unknown_term
-            ):
-                file.write(row.model_dump_json() + "\n")
-                file.flush()
-                print(f"{row.key}: {row.verdict or row.failure}, {row.seconds:.0f} s", flush=True)
-    print_table([row for row in _read(arguments.out) if row.robot in arguments.only])
-
-
-def _read(path: Path) -> list[Row]:
-    """The rows of a file, none if it is not there; a last line that was cut off is removed."""
-    if not path.exists():
-        return []
-    written = path.read_bytes()
-    whole = written[: written.rfind(b"\n") + 1]
-    if len(whole) < len(written):
-        path.write_bytes(whole)
-    return [Row.model_validate_json(line) for line in whole.decode().splitlines()]
+        done = {row.key for row in file.results}
+        for row in _carried_out(arguments.only, done, unknown_term=not arguments.no_unknown_term):
+            file.add(row)
+            print(f"{row.key}: {row.verdict or row.failure}, {row.seconds:.0f} s", flush=True)
+    print_table([row for row in file.results if row.robot in arguments.only])
 
 
 def _carried_out(robots: Sequence[str], done: set[str], *, unknown_term: bool) -> Iterator[Row]:

@@ -14,16 +14,15 @@ interval, and combinations that are independent in the covariance: those that th
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from results_file import ResultsFile, in_processes
 from scipy.stats import norm
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
@@ -31,7 +30,6 @@ from omnibench.data.references import Reference, References
 from omnibench.fit.calibrate import calibrate
 from omnibench.fit.open_combinations import WORST
 from omnibench.fit.prior import physical_prior_root, physical_tolerance
-from omnibench.processes import one_thread
 from omnibench.robot.calibration import matrix_rows
 from omnibench.robot.kinematics import Robot
 from omnibench.simulate.config import FlowerConfig, Truth
@@ -196,25 +194,6 @@ def covered(case: Case, seed: int) -> Row:
     return Row(str(case), seed, *rounded, f"{found.source}; {run.result.reason}"[:240])
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The rows of a file, none if it is not there; a last line that was cut off is left out."""
-    lines = path.read_text().split("\n")[:-1] if path.exists() else []
-    return [Row(**json.loads(line)) for line in lines]
-
-
-def carry_out(missing: Sequence[tuple[Case, int]], path: Path, workers: int) -> Iterator[Row]:
-    """Fit sets and add each row to the file at once."""
-    written = path.read_bytes() if path.exists() else b""
-    with path.open("wb") as file:
-        file.write(written[: written.rfind(b"\n") + 1])
-    with one_thread(), ProcessPoolExecutor(workers) as pool, path.open("a") as file:
-        for done in as_completed([pool.submit(covered, case, seed) for case, seed in missing]):
-            row = done.result()
-            file.write(json.dumps(asdict(row)) + "\n")
-            file.flush()
-            yield row
-
-
 def table(rows: Iterable[Row], cases: Iterable[Case]) -> Iterator[str]:
     """A line for every case: share of the intervals that hold the truth, with its 95 % interval by sets.
 
@@ -258,13 +237,14 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only print the table")
     arguments = parser.parse_args()
     cases = [Case(robot, kind, arguments.calibrator) for robot in arguments.robots for kind in arguments.kinds]
-    rows = read_rows(arguments.out)
+    file = ResultsFile(arguments.out, Row)
     if not arguments.table:
-        done = {(row.case, row.seed) for row in rows}
+        done = {(row.case, row.seed) for row in file.results}
         seeds = range(arguments.first, arguments.first + arguments.sets)
         missing = [(case, seed) for seed in seeds for case in cases if (str(case), seed) not in done]
-        rows += carry_out(missing, arguments.out, arguments.workers)
-    print("\n".join(table(rows, cases)))
+        for row in in_processes(covered, missing, arguments.workers):
+            file.add(row)
+    print("\n".join(table(file.results, cases)))
 
 
 if __name__ == "__main__":

@@ -12,14 +12,14 @@ where it was.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from hidden.disturbances import NULL_KINDS
 from hidden.session_sets import session_set
+from results_file import ResultsFile
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover.fitting import extend, fit_matrix
@@ -138,17 +138,13 @@ def _with_effect(dataset: Dataset, name: str) -> SessionComparison:
 
 def carried_out(wanted: Sequence[Case], sets: int, path: Path | None) -> list[Answer]:
     """The answers on all sets; those of the file are not sought again."""
-    lines = path.read_text().splitlines() if path and path.exists() else []
-    answers = [Answer(**json.loads(line)) for line in lines]
-    done = {(each.case, each.seed) for each in answers}
+    file = ResultsFile(path, Answer)
+    done = {(each.case, each.seed) for each in file.results}
     for case in wanted:
         for seed in range(sets * case.times):
             if (case.name, seed) not in done:
-                answers.append(answer(case, seed))
-                if path:
-                    with path.open("a") as file:
-                        file.write(json.dumps(asdict(answers[-1])) + "\n")
-    return answers
+                file.add(answer(case, seed))
+    return file.results
 
 
 def print_table(answers: Sequence[Answer]) -> None:

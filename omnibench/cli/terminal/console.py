@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.segment import Segment
 
     from omnibench.report.result import Result
-    from omnibench.robot.calibration import HeldOutVerdict
 
 _MOST_ALIKE = 3  # warnings that differ by places and numbers alone and are shown one by one
 _PIPED_WIDTH = 160  # columns of a table in a pipe or a file, where nobody's window is too narrow
@@ -98,16 +97,6 @@ def print_next(result: Result) -> None:
     """Print what came out and what to do next."""
     step = result.next_step()
     print_ending(step.outcome, step.then, *step.command)
-
-
-def print_verdict(verdict: HeldOutVerdict, subject: str = "", sessions: Iterable[str] = ()) -> None:
-    """The last lines of ``calibrate``, ``evaluate`` and ``compare``: what held-out runs say, and which these are.
-
-    sessions: sentences on sessions that differ from the others or could not be compared.
-    """
-    for sentence in (f"{subject}{verdict.sentence}", verdict.detail, *sessions):
-        if sentence:
-            say(sentence)
 
 
 def print_ending(outcome: str, then: str = "", *command: object) -> None:

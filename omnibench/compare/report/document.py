@@ -13,7 +13,7 @@ from omnibench.compare.report.searches import search_blocks
 from omnibench.compare.result import Cell, ComparisonResult
 from omnibench.errors import DataError
 from omnibench.report import blocks as page
-from omnibench.report.figures import DESIGN, is_drawn, motion_system, parameters
+from omnibench.report.figures import DESIGN, is_drawn, motion_system
 from omnibench.report.numbers import count, listing
 from omnibench.report.recording.data_results import RobotResult
 from omnibench.report.recording.section import has_recording, recording_section
@@ -162,11 +162,9 @@ def robot_picture(view: sets.DatasetView) -> page.FigureGrid | None:
             colour = style.colour if style.colour != DESIGN.colour else INK
             item = replace(style, key="fitted", colour=colour, dash="dash")
             fitted = [(item, robot.model_copy(update={"wheels": tuple(wheels)}))]
-    system, items = motion_system(robot)
     words = "A wheel's width is not known; its length is its diameter."
     words += " A fitted geometry takes up whatever else is wrong with the model." if fitted else ""
-    legend = (*items, *(item for item, _ in fitted))
-    return page.FigureGrid((system, parameters(robot, fitted)), legend, 2, words, "robot")
+    return replace(motion_system(robot, fitted), caption=words)
 
 
 def _recording(view: sets.DatasetView) -> Iterator[page.Block]:

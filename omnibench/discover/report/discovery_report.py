@@ -1,259 +1,181 @@
-"""The report of a discovery as one HTML file: where the model fails, what is missing, how sure, how much better."""
+"""The page of a discovery: the answer, then where the model fails, the evidence, and what to do about it."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 
 from omnibench.discover.report import tables
-from omnibench.discover.report.evidence_figures import candidate_grid, gap_grid, hidden_grid, waterfall_grid
-from omnibench.discover.report.residuals import ALONE, EXTENDED, PLAIN
-from omnibench.discover.report.where_section import where_section
-from omnibench.discover.result import Discovery, Gap, NamedEffect, experiment_file
+from omnibench.discover.report.figures import ALONE, EXTENDED, PLAIN, candidate_grid, error_grid, residual_blocks
+from omnibench.discover.result import Discovery, experiment_file
 from omnibench.environment import package_versions
 from omnibench.report import blocks as page
 from omnibench.report.numbers import count, fixed, listing, noise_in_words, typeset
-from omnibench.report.path_pictures import DESIGN_ITEM, paths_before_after
+from omnibench.report.path_pictures import DESIGN_ITEM, Models, paths_before_after
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 
 def discovery_report(discovery: Discovery, options: str) -> page.Document:
     """The report as blocks. options: the effective options, in YAML."""
-    dataset, better = discovery.dataset, "How much better" if discovery.extends else "How well it predicts"
-    runs = "held-out runs" if discovery.held_out else "training runs"
+    dataset = discovery.dataset
+    unseen = [tables.unseen_table(discovery)] if discovery.measurements or discovery.not_looked_for else []
+    alike = "Effects that look alike here, and how large one that was not found could be."
+    titles: tuple[tuple[str, str, str, Iterable[page.Block]], ...] = (
+        ("where", "Where it shows", "What the errors of the plain matrix depend on.", _where(discovery)),
+        ("evidence", "Evidence for and against", "What each effect would explain.", evidence_blocks(discovery)),
+        ("parameters", "Parameters", "The effects that were added.", parameter_blocks(discovery)),
+        ("alike", "What the data cannot tell", alike, alike_blocks(discovery)),
+        ("better", "Errors before and after", "Down to the floor of the noise.", _errors(discovery)),
+        ("drive", "What to drive next", "The runs that tell look-alikes apart.", experiment_blocks(discovery)),
+        ("absorbed", "What no run would show", "Effects that a matrix holds.", unseen),
+        ("basis", "How to reproduce", "Data, noise, options and files.", _basis(discovery, options)),
+    )
+    sections = (
+        page.Section(key, title, blocks, about=about, folded=True)
+        for key, title, about, made in titles
+        if (blocks := tuple(made))
+    )
     return page.Document(
         title=f"What the odometry model lacks: {dataset.name}",
         subtitle=dataset.description,
-        sections=(
-            _answer(discovery),
-            page.Section("what", "What", tuple(what_blocks(discovery)), about="What is missing, with its parameters."),
-            _folded("better", better, f"Errors before and after, on {runs}.", _how_much_better(discovery)),
-            replace(where_section(discovery), about="What the errors of the plain matrix depend on.", folded=True),
-            _folded("sure", "How sure", "Rivals of the name, and what could still hide.", sure_blocks(discovery)),
-            _folded("basis", "What this rests on", "Data, noise, options and files.", _basis(discovery, options)),
-        ),
+        sections=(_answer(discovery), *sections),
         badges=page.simulated_badge(dataset.simulated),
     )
 
 
-def _folded(key: str, title: str, about: str, blocks: Iterator[page.Block]) -> page.Section:
-    return page.Section(key, title, tuple(blocks), about=about, folded=True)
-
-
 def _answer(discovery: Discovery) -> page.Section:
-    """The section with the answer: what was gained and the cause, paths before and after, and the warnings."""
-    new_motions = tables.extrapolations_in_words(discovery.extrapolations)
-    answer = typeset(tables.answer_in_words(discovery))
-    headline = typeset(discovery.headline)
+    """What was gained and the cause, paths before and after, and the warnings."""
+    answer, headline = typeset(tables.answer(discovery)), typeset(discovery.headline)
     # Paths of a few held-out runs, or of training runs where none are held out, by both models
     dataset, training = discovery.dataset, set(discovery.trajectories)
     held_out = [run for run in dataset.trajectories if run.id not in training]
     plain = discovery.plain.model
-    models: list[tuple[page.LegendItem, OdometryModel]] = [(PLAIN, plain), (EXTENDED, discovery.extended.model)]
+    models: Models = [(PLAIN, plain), (EXTENDED, discovery.extended.model)]
     if not discovery.extends:
         models = [(DESIGN_ITEM, OdometryModel.of_design(dataset.robot, plain.integration)), (ALONE, plain)]
+    doubts = tuple(map(typeset, discovery.notes))
+    if discovery.extrapolations:
+        doubts = ("Held-out runs drive motions that no training run had: see Errors before and after.", *doubts)
     return page.answer_section(
         answer,
         tuple(_tiles(discovery)),
         paths_before_after(held_out or dataset.trajectories, models, "held-out" if held_out else "training"),
         *([page.Paragraph(headline)] if headline != answer else []),
-        page.Callout("Motions that the training runs never had", new_motions, "warning"),
-        page.Callout("Before you rely on it", tuple(map(typeset, discovery.notes))),
+        page.Callout("Before you rely on it", doubts, "warning" if discovery.extrapolations else "plain"),
     )
 
 
 def _tiles(discovery: Discovery) -> Iterator[page.Fact]:
     held = tables.decisive(discovery)
+    where, gap = "training runs", discovery.gap
     if held is not None:
-        position, heading = tables.final_errors_in_words(discovery, held)
-        where = f"{tables.held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}"
-        yield page.Fact("Final position error, mean", position, where)
-        yield page.Fact("Final heading error, mean", heading, where)
-        yield _gap_fact(discovery, held.eq6, where)
-    else:
-        change = f", {tables.gap_in_words(discovery.gap)}" if discovery.extends else ""
-        yield _gap_fact(discovery, discovery.gap, f"training runs{change}")
-    yield page.Fact("Cause" if discovery.effects else "Verdict", *_cause(discovery))
-
-
-def _cause(discovery: Discovery) -> tuple[str, str]:
-    """The name of what is missing, and the verdict with the weight of the name."""
-    sessions = ", sessions not compared" if discovery.sessions.doubts else ""
-    sessions = ", sessions differ" if discovery.sessions.differences else sessions
-    verdict = f"{tables.verdict_in_words(discovery)}{sessions}"
-    if not discovery.effects:
-        unnamed = " and of the gap an unnamed term closes what is shown" if discovery.extends else ""
-        return discovery.verdict, f"{verdict}{unnamed}"
-    first, *more = discovery.effects
-    others = first.confusable_with
-    name = first.name.replace("_", " ")
-    name += f" or {len(others)} others" if len(others) > 1 else f" or {others[0].replace('_', ' ')}" if others else ""
-    name += f", and {len(more)} more" if more else ""
-    if discovery.verdict == "unknown":
-        verdict = f"likeliest, but no name is sure{sessions}"
-    return name, f"{verdict}; weight of the name {tables.weight_in_words(first.weight)}"
-
-
-def _gap_fact(discovery: Discovery, gap: Gap, where: str) -> page.Fact:
-    """The share of the gap that is closed or, where nothing was added, the error beside its floor."""
+        where, gap = tables.held_out_runs(discovery, held), held.eq6
+        for name, before, after in tables.final_errors(held):
+            yield page.Fact(name, f"{before.split()[0]} → {after}" if discovery.extends else before, where)
+    before, after, floor = tables.gap_values(gap)
     if discovery.extends:
-        return page.Fact("Gap closed, Eq. (6)", tables.closed_in_words(gap), where)
-    decimals = tables.gap_decimals(gap)
-    floor = "" if gap.floor is None else f"floor {fixed(gap.floor, decimals)}; "
-    return page.Fact("Eq. (6)", fixed(gap.before, decimals), f"{floor}{where}")
+        note = f"{before} → {after}, floor {floor}; {where}"
+        yield page.Fact(f"Gap closed, {tables.METRICS[gap.metric]}", tables.closed_share(gap), note)
+    else:
+        yield page.Fact(tables.METRICS[gap.metric], before, f"floor {floor}; {where}")
+    verdict = tables.verdict_in_words(discovery)
+    if discovery.verdict == "unknown" and discovery.effects:
+        verdict = "likeliest, but no name is sure"
+    elif discovery.verdict == "unknown" and discovery.extends:
+        verdict += "; an unnamed term closes of the gap what is shown"
+    if discovery.sessions.differences or discovery.sessions.doubts:
+        verdict += ", sessions differ" if discovery.sessions.differences else ", sessions not compared"
+    if not discovery.effects:
+        yield page.Fact("Verdict", discovery.verdict, verdict)
+        return
+    first, *more = discovery.effects
+    names = [name.replace("_", " ") for name in (first.name, *first.confusable_with)]
+    cause = " or ".join(names) if len(names) < 3 else f"{names[0]} or {len(names) - 1} others"
+    also = f", and {len(more)} more" if more else ""
+    yield page.Fact("Cause", f"{cause}{also}", f"{verdict}; weight of the name {tables.weight_in_words(first.weight)}")
 
 
-def what_blocks(discovery: Discovery) -> Iterator[page.Block]:
-    """The effects: those found, with their parameters, and those that a matrix absorbs."""
-    yield page.Paragraph(tables.verdict_at_length(discovery))
-    if discovery.effects:
-        for effect in discovery.effects:
-            yield page.Callout(
-                f"{effect.name}: stage {effect.stage} ({tables.STAGES[effect.stage]})", tuple(_effect_remarks(effect))
-            )
-        yield tables.parameter_table(discovery.effects, discovery.dataset)
-    for number, experiment in enumerate(discovery.experiments, 1):
-        # The paragraph, table and config of the runs that tell the members of a class apart
-        yield page.Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
-        if experiment.commands:
-            yield tables.experiment_table(experiment)
-            title = f"These runs as a config ({experiment_file(number)}): simulate them before they are driven"
-            yield page.Details(title, (page.Code(experiment.config),))
-    if discovery.absorbed:
-        yield tables.absorbed_table(discovery)
-    if discovery.not_looked_for:
-        yield page.Details(
-            f"Effects that these recordings cannot show ({len(discovery.not_looked_for)})",
-            (tables.not_looked_for_table(discovery),),
-        )
+def _where(discovery: Discovery) -> Iterator[page.Block]:
+    """What the residuals depend on, by command and over covariates."""
+    if discovery.where:
+        yield tables.dependence_table(discovery.where, "Where the plain matrix fails")
+    else:
+        yield page.Paragraph("The residuals depend on nothing that was tried by more than noise explains.")
+    yield from residual_blocks(discovery)
+    yield page.Paragraph(
+        "A point is the error of the motion in its bin that explains the residuals best, beside those of the other "
+        "bins; the bands hold 95 % of what comes out by chance (omnibench guide reports). What was not recorded, or "
+        "hardly varies, has no picture.",
+        "note",
+    )
 
 
-def _effect_remarks(effect: NamedEffect) -> Iterator[str]:
-    yield effect.physics
-    if effect.confusable_with:
-        others = listing(list(effect.confusable_with))
-        yield f"These data cannot tell it from {others}: any of them closes the gap as well."
-    if effect.in_doubt:
-        yield f"In doubt: {effect.in_doubt}."
-    if effect.source:
-        yield f"Described in: {effect.source}."
-
-
-def sure_blocks(discovery: Discovery) -> Iterator[page.Block]:
-    """Certainty: weights, candidates, what is left, look-alikes, effects that may still hide."""
-    if discovery.effects:
-        yield page.Facts(
-            tuple(
-                page.Fact(
-                    tables.effect_in_words(effect).replace("_", " "),
-                    tables.weight_in_words(effect.weight),
-                    f"weight of the name; χ² falls by {count(effect.chi_square)} "
-                    f"for {plural(effect.degrees_of_freedom, 'parameter')}",
-                )
-                for effect in discovery.effects
-            ),
-            "tiles",
-        )
+def evidence_blocks(discovery: Discovery) -> Iterator[page.Block]:
+    """The candidates of each step with their weights, and what is left after all that was added."""
     yield from filter(None, [candidate_grid(discovery)])
     if discovery.left:
         caption = "What the residuals still depend on, after all that was added"
         yield tables.dependence_table(discovery.left, caption)
     elif discovery.effects:
-        yield page.Paragraph(
-            "With the effects that were added, the residuals depend on nothing that was tried: noise is left."
-        )
-    if discovery.classes:
-        yield page.Callout(
-            "What these data cannot tell apart", tuple(" or ".join(names) for names in discovery.classes), "plain"
-        )
+        yield page.Paragraph("With what was added, the residuals depend on nothing that was tried: noise is left.")
+
+
+def parameter_blocks(discovery: Discovery) -> Iterator[page.Block]:
+    """The effects that were found, their physics, doubts and sources, and their parameters."""
+    for effect in discovery.effects:
+        remarks = (effect.in_doubt and f"In doubt: {effect.in_doubt}.", effect.source and f"Source: {effect.source}.")
+        stage = f"{effect.name}: stage {effect.stage} ({tables.STAGES[effect.stage]})"
+        yield page.Callout(stage, tuple(filter(None, (effect.physics, *remarks))))
+    if discovery.effects:
+        yield tables.parameter_table(discovery.effects, discovery.dataset)
+
+
+def alike_blocks(discovery: Discovery) -> Iterator[page.Block]:
+    """Classes of effects that look alike, and how large an effect that was not found could be."""
+    classes = tuple(" or ".join(names) for names in discovery.classes)
+    if classes:
+        yield page.Callout("What these data cannot tell apart", classes)
     if discovery.hidden:
-        if (grid := hidden_grid(discovery.hidden)) is not None:
-            yield grid
-        yield page.Details(
-            f"These effects in numbers ({len(discovery.hidden)})", (tables.hidden_table(discovery.hidden),)
-        )
+        yield tables.hidden_table(discovery.hidden)
 
 
-def _how_much_better(discovery: Discovery) -> Iterator[page.Block]:
-    """The gain: errors before and after against the noise floor, on held-out runs."""
-    if discovery.held_out:
-        yield page.Paragraph(_better_in_words(discovery))
-    yield from filter(None, [gap_grid(discovery), waterfall_grid(discovery)])
-    yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
-    if len(discovery.steps) > 1:
-        yield page.Details("Every step in numbers", (tables.step_table(discovery),))
+def _errors(discovery: Discovery) -> Iterator[page.Block]:
+    yield error_grid(discovery)
+    yield tables.gap_table(discovery)
     if discovery.extrapolations:
-        words = (
-            "The held-out runs drive motions that no training run had. There the extended model extrapolates, and its "
-            "bound may be wider than the plain matrix's.",
-        )
-        yield page.Callout("Warning: new motions", words, "warning")
         yield tables.extrapolation_table(discovery.extrapolations)
 
 
-def _better_in_words(discovery: Discovery) -> str:
-    held = tables.decisive(discovery)
-    assert held is not None
-    where = f"On the {tables.held_out_in_words(discovery, held)}, {plural(held.runs, 'run')}, "
-    before, after = (
-        f"{fixed(1e3 * position, 1)} mm and {fixed(math.degrees(heading), 2)}°"
-        for position, heading in zip(held.position_m, held.heading_rad, strict=True)
-    )
-    if not discovery.extends:
-        return f"{where}the mean final error is {after} by the plain matrix, to which nothing was added."
-    closed = (
-        ""
-        if held.eq6.closed is None
-        else f": {tables.closed_in_words(held.eq6)} of the gap down to the floor is closed"
-    )
-    decimals = tables.gap_decimals(held.eq6)
-    return (
-        f"{where}the mean final error goes from {before} by the plain matrix to {after} by the extended model; Eq. (6) "
-        f"goes from {fixed(held.eq6.before, decimals)} to {fixed(held.eq6.after, decimals)}{closed}."
-    )
+def experiment_blocks(discovery: Discovery) -> Iterator[page.Block]:
+    """The runs that tell the members of a class apart, with their configs."""
+    for number, experiment in enumerate(discovery.experiments, 1):
+        yield page.Paragraph(f"To separate {listing(list(experiment.separates))}: {experiment.description}")
+        if experiment.commands:
+            yield tables.experiment_table(experiment)
+            title = f"These runs as a config ({experiment_file(number)}): simulate them before they are driven"
+            yield page.Details(title, (page.Code(experiment.config),))
 
 
 def _basis(discovery: Discovery, options: str) -> Iterator[page.Block]:
-    """The basis of it all: data, noise, options and files."""
     dataset, noise = discovery.dataset, discovery.noise
     position, heading = noise_in_words(noise.noise)
-    runs = [run for run in dataset.trajectories if run.split == "train"]
-    commands = {run.command for run in runs if run.command is not None}
-    sessions = {run.session for run in runs if run.session is not None}
-    facts = [
-        page.Fact("Data set", dataset.name, "simulated" if dataset.simulated else "recorded"),
-        page.Fact("Source", dataset.source),
-        page.Fact(
-            "Training runs",
-            f"{plural(len(discovery.trajectories), 'run')}, {plural(discovery.poses, 'reference pose')}",
-            f"{plural(discovery.outliers, 'pose')} left out as outliers" if discovery.outliers else "",
-        ),
-        page.Fact("Commands", count(len(commands)) if commands else "not known"),
-        page.Fact("Sessions", listing(sorted(sessions)) if sessions else "not known"),
+    runs = f"{plural(len(discovery.trajectories), 'run')}, {plural(discovery.poses, 'reference pose')}"
+    versions = ", ".join(f"{name} {version}" for name, version in package_versions().items())
+    facts = (
+        page.Fact("Data set", dataset.name, dataset.source),
+        page.Fact("Content (SHA-256)", dataset.hash[:16]),
+        page.Fact("Training runs", runs, f"poses left out as outliers: {count(discovery.outliers)}"),
         page.Fact("Noise of positions", position),
         page.Fact("Noise of headings", heading),
-        page.Fact(
-            "Noise from",
-            noise.description,
-            "repetitions show it, whatever the model gets wrong"
-            if noise.source == "repetitions"
-            else "nothing is repeated: what no model here expresses counts as noise",
-        ),
-        page.Fact("Robot", dataset.robot.name, plural(len(dataset.robot.wheels), "wheel")),
+        page.Fact("Noise from", noise.source, noise.description),
         page.Fact("Odometry", "exact arcs" if discovery.extended.integration == "arc" else "Euler steps, Eq. (1)"),
-        page.Fact("Content (SHA-256)", dataset.hash[:16]),
         page.Fact("Time", f"{fixed(discovery.seconds, 1)} s"),
-        page.Fact("Versions", ", ".join(f"{name} {version}" for name, version in package_versions().items())),
-    ]
-    yield page.Facts(tuple(fact for fact in facts if fact.value))
-    yield page.Callout("Warnings on reading the data", dataset.warnings, "warning")
-    files = "model.yaml is the extended calibration and plain.yaml the matrix alone, both"
-    if not discovery.extends:
-        files = "plain.yaml is the matrix alone, to which nothing was added,"
-    yield page.Paragraph(
-        f"Beside this report: {files} ready for omnibench evaluate, simulate and live; discovery.json holds all "
-        "figures, residuals.parquet every residual before and after."
+        page.Fact("Versions", versions),
     )
-    yield page.Details("Effective options (config.yaml)", (page.Code(options),))
+    yield page.Facts(facts)
+    yield page.Callout("Warnings on reading the data", dataset.warnings, "warning")
+    files = "model.yaml is the extended calibration, plain.yaml the matrix alone"
+    if not discovery.extends:
+        files = "plain.yaml is the matrix, to which nothing was added"
+    yield page.Paragraph(f"Beside this report: {files}. All files: omnibench guide discover.")
+    yield page.Code(options, "Effective options (config.yaml)")

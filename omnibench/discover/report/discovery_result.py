@@ -1,4 +1,4 @@
-"""A discovery as it is shown on a terminal, in a notebook and at a prompt; its page is that of discovery_report."""
+"""A discovery as it is shown: on a terminal, in a notebook and at a prompt."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ import polars as pl
 
 from omnibench.discover.output import residual_table
 from omnibench.discover.report import tables
-from omnibench.discover.report.evidence_figures import gap_grid
+from omnibench.discover.report.figures import error_grid
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
 from omnibench.report.blocks import Cell, FigureGrid, Table, Tone
-from omnibench.report.numbers import listing
 from omnibench.report.result import NextStep, Remark, Result
-from omnibench.words import plural
+from omnibench.words import kind_of_data, plural
 
 # So much is shown that the answer fits into a screen; the report has the rest.
 _HIDDEN = 4  # lines of effects that could still hide
 _MOST_DEPENDENCES = 4  # lines of covariates that the residuals depend on
 _PARAMETERS = 9  # lines for an effect
-_LINES = 3  # notes, and as many warnings
+_LINES = 3  # notes, and as many motions that were not driven in training
 _COLUMNS = {
     **dict.fromkeys(("effect", "stage"), pl.String),
     "weight": pl.Float64,
@@ -38,7 +37,10 @@ class DiscoveryResult(Result):
 
     def __init__(self, discovery: Discovery, folder: Path | None = None) -> None:
         self.discovery, self.folder = discovery, folder
-        self.title = f"Discovery on {tables.data_in_words(discovery)}"
+        dataset = discovery.dataset
+        runs = f"{plural(len(discovery.trajectories), 'training run')}, {plural(discovery.poses, 'reference pose')}"
+        self.data = f"{dataset.name} ({kind_of_data(dataset.simulated)}): {runs}"
+        self.title = f"Discovery on {self.data}"
         self.warnings = discovery.dataset.warnings
 
     def sentence(self) -> str:
@@ -49,7 +51,7 @@ class DiscoveryResult(Result):
         discovery = self.discovery
         verdict = f"verdict: {discovery.verdict} ({tables.verdict_in_words(discovery)})"
         tone: Tone = "good" if discovery.verdict in ("named", "none") else "warning"
-        return [Remark(tables.data_in_words(discovery)), Remark(verdict, tone), Remark(discovery.headline)]
+        return [Remark(self.data), Remark(verdict, tone), Remark(discovery.headline)]
 
     def next_step(self) -> NextStep:
         discovery, folder = self.discovery, self.folder or Path()
@@ -64,7 +66,7 @@ class DiscoveryResult(Result):
         return NextStep("nothing was added to the matrix", "use the plain calibration", command)
 
     def tables(self) -> Sequence[Table]:
-        return [_in_brief(table) for table in self._tables()]
+        return list(map(_in_brief, self._tables()))
 
     def _tables(self) -> Iterator[Table]:
         discovery = self.discovery
@@ -75,13 +77,15 @@ class DiscoveryResult(Result):
             strongest = {found.covariate: found for found in reversed(discovery.where)}  # the first of each covariate
             shown = [found for found in discovery.where if strongest[found.covariate] is found][:_MOST_DEPENDENCES]
             yield tables.dependence_table(shown, "Where the plain matrix fails")
-        yield tables.held_out_table(discovery) if discovery.held_out else tables.gap_table(discovery)
+        yield tables.gap_table(discovery)
+        if discovery.extrapolations:
+            yield tables.extrapolation_table(discovery.extrapolations[:_LINES])
         if discovery.hidden:
-            yield tables.hidden_table(tables.worst_of_each(discovery.hidden)[:_HIDDEN])
+            yield tables.hidden_table(discovery.hidden, _HIDDEN)
         yield from (tables.experiment_table(each) for each in discovery.experiments if each.commands)
 
     def remarks(self) -> Sequence[Remark]:
-        return [Remark(line) for line in self._remarks()]
+        return list(map(Remark, self._remarks()))
 
     def _remarks(self) -> Iterator[str]:
         discovery = self.discovery
@@ -92,17 +96,15 @@ class DiscoveryResult(Result):
                 yield f"In doubt: {effect.name}: {effect.in_doubt}."
         if discovery.left:
             left = dict.fromkeys(f"{each.covariate} ({tables.chance(each.p_value)})" for each in discovery.left)
-            yield f"Left over: the residuals still depend on {listing(list(left))}."
+            yield f"Left over: the residuals still depend on {', '.join(left)}."
         if discovery.classes:
             yield f"These data cannot tell apart: {'; '.join(' or '.join(names) for names in discovery.classes)}."
         if discovery.absorbed:
-            absorbed = listing(list(discovery.absorbed), 12)
-            yield f"Absorbed by any matrix, and so never named: {absorbed}."
-        new_motions = tables.extrapolations_in_words(discovery.extrapolations)
-        for lines, head in ((new_motions, "warning: not driven in training: "), (discovery.notes, "- ")):
-            yield from (f"{head}{line}" for line in lines[:_LINES])
-            if len(lines) > _LINES:
-                yield f"{plural(len(lines) - _LINES, 'more remark')} in the report"
+            yield f"Absorbed by any matrix, and so never named: {', '.join(discovery.absorbed)}."
+        yield from (f"- {note}" for note in discovery.notes[:_LINES])
+        more = sum(max(0, len(lines) - _LINES) for lines in (discovery.notes, discovery.extrapolations))
+        if more:
+            yield f"{plural(more, 'more remark')} in the report"
         if self.folder is not None:
             kind = "extended" if discovery.extends else "plain"
             what = "extended calibration" if discovery.extends else "plain calibration, as nothing was added"
@@ -113,7 +115,7 @@ class DiscoveryResult(Result):
             yield f"report: {self.folder / 'report.html'}"
 
     def figures(self) -> Sequence[FigureGrid]:
-        return [gap_grid(self.discovery)]
+        return [error_grid(self.discovery)]
 
     def json(self) -> Mapping[str, Any]:
         return discovery_document(self.discovery, self.folder or Path())

@@ -11,25 +11,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
 from omnibench.discover.regressors.paths import Paths, make_paths
 from omnibench.discover.result import Discovery
 from omnibench.fit.noise import Whitener, grouped
-from omnibench.report.blocks import Figure, FigureGrid, LegendItem
-from omnibench.report.figures import area, joined, marks
-from omnibench.report.numbers import listing
-from omnibench.report.style import QUIET, plot, text
-from omnibench.robot.kinematics import Array, relative, rotation
+from omnibench.robot.kinematics import Array, rotation
 
-# Standard deviations that hold 95 % of a normal distribution, on a line and in the plane.
 NORMAL_95 = 1.96  # standard deviations within which 95 % of a normal number lie
-CIRCLE_95 = 2.448  # sqrt(-2 ln 0.05), standard deviations within which 95 % of a pair of normal numbers lie
 _STAMPS = 15_000  # reference poses drawn of all runs, at most, so that a report takes seconds
 # Share of the largest eigenvalue of the information, below which a direction is left open: its standard error is 100
 # times that of the best known one, wider than any figure.
@@ -49,13 +41,12 @@ class Fitted:
 class CommandResidual:
     """Final residuals of one command: means over its runs, in the frame of the start pose (x forward).
 
-    end (3,): final pose; means (2, 3): before and after, m, m, rad; error (3,): their standard error by the noise.
+    run: the first of them. means (2, 3): before and after, m, m, rad; error (3,): their standard error by the noise.
     """
 
     name: str
     run: Trajectory
     runs: int
-    end: Array
     means: Array
     error: Array
 
@@ -92,16 +83,14 @@ class Residuals:
         residuals = []
         for members in grouped([(run.command, run.id if run.command is None else None) for run in self.runs]):
             first = self.runs[members[0]]
-            ends, finals, variances = [], [], []
+            finals, variances = [], []
             for index in members:
                 run = self.runs[index]
-                ends.append(relative(run.start, run.final_pose))
                 finals.append([rotation(-run.start[2]) @ own[index][-1] for own in self.each])
                 variances.append(self.deviations(run.pose_times[-1:])[0] ** 2)
             error: Array = np.sqrt(np.sum(variances, axis=0)) / len(members)
-            end: Array = np.mean(ends, axis=0)
             means: Array = np.mean(finals, axis=0)
-            residuals.append(CommandResidual(first.command or first.id, first, len(members), end, means, error))
+            residuals.append(CommandResidual(first.command or first.id, first, len(members), means, error))
         return tuple(residuals)
 
     @cached_property
@@ -111,11 +100,6 @@ class Residuals:
         return make_paths(
             self._calibration.robot, self._calibration.matrix_array, logs, self._calibration.sample_period
         )
-
-    @cached_property
-    def stamp_numbers(self) -> NDArray[np.intp]:
-        """The number (S,) of each of the paths' stamps within its run, from 0 on."""
-        return np.concatenate([chosen for _, chosen in self._thinned])
 
     @cached_property
     def _thinned(self) -> list[tuple[Trajectory, NDArray[np.intp]]]:
@@ -163,16 +147,6 @@ class Residuals:
         errors = np.maximum(noise[:, None], flipped)
         return Fitted(np.where(determined[:, None], values, np.nan), np.where(determined[:, None], errors, np.nan))
 
-    def fit_runs(self, columns: Array) -> Fitted:
-        """Fit one change of the motion (S, 3, 1) to each run by itself: values (Z, 2), errors by the noise model."""
-        values, errors = np.full((len(self.runs), 2), np.nan), np.full((len(self.runs), 2), np.nan)
-        for row, (part, (whitener, residuals)) in enumerate(zip(self.paths.parts, self._white, strict=True)):
-            white = whitener(columns[part]).reshape(-1)
-            if (information := float(white @ white)) > 0:
-                values[row] = white @ residuals / information
-                errors[row] = self.spread / math.sqrt(information)
-        return Fitted(values, errors)
-
     @cached_property
     def _clusters(self) -> list[tuple[int, ...]]:
         """The runs of each command, or each run by itself where commands are few."""
@@ -186,181 +160,3 @@ def shares(values: Array, edges: Sequence[float] | Array) -> Array:
     bins = np.where(values == edges[-1], len(edges) - 2, bins)
     found: Array = (bins[:, None] == np.arange(len(edges) - 1)).astype(float)
     return found
-
-
-BEFORE, AFTER, FLOOR = "#d97706", "#0072b2", "#8a8f98"
-BAND = "rgba(102,114,127,0.20)"
-_NOISE = "#c3c9d0"
-_VAGUE = 3.0  # usual half-widths of the band: a value within a wider one says nothing; only the drawing hangs on it
-_HEIGHT = 270  # px
-_BY_CHANCE = 0.05  # share of the values that leave bands of 95 % by chance
-# Why a test may find what no value of a figure shows.
-_WITHIN = (
-    "The test in the table above, of all values together and against noise alone, may still find a dependence: the "
-    "band also holds what depends on other covariates, so that what is missing need not depend on this one."
-)
-# A line across the plot at y = 0, as part of the layout: adding it to a figure is much slower.
-ZERO = {"type": "line", "xref": "x domain", "x0": 0, "x1": 1, "y0": 0, "y1": 0, "line": {"color": QUIET, "width": 1}}
-
-
-@dataclass(frozen=True)
-class ModelStyle(LegendItem):
-    """The style in which one of the two models is drawn. index: 0 before, 1 after."""
-
-    index: int = 0
-
-
-PLAIN = ModelStyle("before", "plain matrix (before)", BEFORE)
-ALONE = ModelStyle("before", "plain matrix", BEFORE)
-EXTENDED = ModelStyle("after", "extended model (after)", AFTER, index=1)
-NOISE = LegendItem("noise", "noise alone, 95 %", _NOISE)
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One model's values (n,) over x (n,), NaN where unknown. half_width (n,): the 95 % band of chance."""
-
-    style: ModelStyle
-    values: Array
-    half_width: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """The content of one plot: curves over x (n,) and the titles of its axes.
-
-    amplitude: values are never below 0. shared: all curves have the band of the noise alone. ticks: distance between
-    ticks of x. words: a text for each point, shown on hovering.
-    """
-
-    title: str
-    x: Array
-    curves: tuple[Curve, ...]
-    x_title: str
-    y_title: str
-    unit: str
-    lines: bool = True
-    amplitude: bool = False
-    shared: bool = False
-    ticks: float | None = None
-    words: tuple[str, ...] = ()
-
-    @property
-    def empty(self) -> bool:
-        return not any(np.isfinite(curve.half_width).any() for curve in self.curves)
-
-
-def legend(styles: Sequence[ModelStyle], noise: bool = True) -> tuple[LegendItem, ...]:
-    """The legend of the models and, if ``noise``, of the noise band."""
-    return (*styles, NOISE) if noise else tuple(styles)
-
-
-def fitted_panels(
-    residuals: Residuals, styles: Sequence[ModelStyle], parts: Sequence[tuple[Array, float, Panel]]
-) -> list[Panel]:
-    """Panels with the curves of one fit.
-
-    parts: for each panel its columns (S, 3, B), as for ``Residuals.fit``, the factor from SI to its unit, and the panel
-    without curves.
-    """
-    if not parts:
-        return []
-    fitted = residuals.fit(np.concatenate([columns for columns, _, _ in parts], axis=2))
-    panels, first = [], 0
-    for columns, factor, panel in parts:
-        part = slice(first, first + columns.shape[2])
-        panels.append(replace(panel, curves=fitted_curves(fitted, styles, factor, part)))
-        first = part.stop
-    return panels
-
-
-def fitted_curves(
-    fitted: Fitted, styles: Sequence[ModelStyle], factor: float, part: slice = slice(None)
-) -> tuple[Curve, ...]:
-    """Curves of a part of the fitted values, with their 95 % bands. factor: from SI to the unit that is drawn."""
-    return tuple(
-        Curve(style, factor * fitted.values[part, style.index], NORMAL_95 * factor * fitted.errors[part, style.index])
-        for style in styles
-    )
-
-
-def grid(panels: Sequence[Panel], styles: Sequence[ModelStyle], caption: str = "") -> FigureGrid | None:
-    """Panels on which the data say something, side by side, those of the same unit on one scale; None without any."""
-    panels = [panel for panel in panels if not panel.empty]
-    figures: list[Figure | None] = [None] * len(panels)
-    for unit in dict.fromkeys(panel.unit for panel in panels):
-        members = [index for index, panel in enumerate(panels) if panel.unit == unit]
-        reach = 1.1 * max(_reach(panels[index]) for index in members) or 1.0
-        for index in members:
-            panel = panels[index]
-            words = f"{panel.title}: {panel.y_title} against {panel.x_title}"
-            figures[index] = Figure(panel.title, _plot(panel, reach), words, _HEIGHT)
-    caption = f"{caption} {_within_bands(panels)}".strip()
-    found = tuple(figure for figure in figures if figure is not None)
-    columns: Literal[2, 3] = 2 if len(found) % 3 and len(found) % 2 == 0 else 3
-    return FigureGrid(found, legend(styles, all(panel.shared for panel in panels)), columns, caption) if found else None
-
-
-def _within_bands(panels: Sequence[Panel]) -> str:
-    """Words on each model of which no more values leave their bands than by chance; empty if there is none."""
-    counts: dict[str, tuple[int, int]] = {}
-    for curve in (curve for panel in panels for curve in panel.curves):
-        outside, known = counts.get(curve.style.label, (0, 0))
-        seen = np.isfinite(curve.values) & np.isfinite(curve.half_width)
-        left = int((np.abs(curve.values) > curve.half_width)[seen].sum())
-        counts[curve.style.label] = (outside + left, known + int(seen.sum()))
-    within = [
-        f"of the {label} {outside} of {known} values leave their band"
-        for label, (outside, known) in counts.items()
-        if known and outside <= _BY_CHANCE * known
-    ]
-    return f"No more than by chance, {listing(within)}. {_WITHIN}" if within else ""
-
-
-def _reach(panel: Panel) -> float:
-    """The largest value to be shown: a bin with few samples, with its wide band, must not flatten all curves."""
-    reach = [0.0]
-    for curve in panel.curves:
-        if np.isfinite(curve.half_width).any():
-            usual, size = np.nanquantile(curve.half_width, 0.75), np.abs(curve.values)
-            vague = (curve.half_width > _VAGUE * usual) & (size <= curve.half_width)
-            reach += [float(1.3 * usual), float(np.nanmax(size[~vague], initial=0.0))]
-    return max(reach)
-
-
-def _plot(panel: Panel, reach: float) -> go.Figure:
-    bands = panel.curves[:1] if panel.shared else panel.curves
-    traces = [_band(panel, curve) for curve in bands]
-    words = panel.words or ("",) * len(panel.x)
-    for curve in panel.curves:
-        hover = f"{text(curve.style.label)}<br>%{{text}} %{{y:.3g}} {panel.unit}"
-        if panel.lines:
-            looks = {"mode": "lines+markers", "line_color": curve.style.colour, "line_width": 2}
-            traces.append(marks(curve.style, 6, panel.x, curve.values, hover=hover, words=words, **looks))
-        else:
-            traces.append(marks(curve.style, 5, panel.x, curve.values, hover=hover, words=words, opacity=0.75))
-    return plot(
-        *traces,
-        xaxis={"title": {"text": panel.x_title}, "dtick": panel.ticks},
-        yaxis={"title": {"text": panel.y_title}, "range": [0 if panel.amplitude else -reach, reach]},
-        shapes=[ZERO],
-    )
-
-
-def _band(panel: Panel, curve: Curve) -> go.Scatter:
-    """The band of chance about zero, in a pale shade of the curve's colour or in that of the noise."""
-    outlines = []
-    known = np.isfinite(curve.half_width)
-    pieces = np.split(np.arange(len(known)), np.flatnonzero(np.diff(known.astype(int))) + 1)
-    margin = 0.015 * float(np.ptp(panel.x))
-    for piece in pieces:
-        if known[piece[0]]:
-            at, half = panel.x[piece], curve.half_width[piece]
-            if len(piece) == 1:  # a bin between empty ones
-                at, half = at + np.array([-margin, margin]), np.repeat(half, 2)
-            low = 0 * half if panel.amplitude else -half
-            outlines.append(np.column_stack([np.append(at, at[::-1]), np.append(half, low[::-1])]))
-    if panel.shared:
-        return area(NOISE.key, BAND, *joined(outlines).T)
-    red, green, blue = (int(curve.style.colour[index : index + 2], 16) for index in (1, 3, 5))
-    return area(curve.style.key, f"rgba({red},{green},{blue},0.16)", *joined(outlines).T)

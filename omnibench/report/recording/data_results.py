@@ -44,8 +44,7 @@ class RobotResult(Result):
     def figures(self) -> Sequence[FigureGrid]:
         if not is_drawn(self.robot):
             raise DataError(f"robot {self.robot.name}: where its wheels stand is not said, so that it cannot be drawn")
-        figure, items = motion_system(self.robot)
-        return [FigureGrid((figure,), tuple(items), 1)]
+        return [motion_system(self.robot)]
 
 
 class DatasetResult(Result):
@@ -102,23 +101,14 @@ class TrajectoryResult(Result):
         return ", ".join(parts)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        references = self.run.references
-        tables: dict[str, Callable[[], pl.DataFrame]] = {"wheels": self._wheels, "poses": self._poses}
-        if references is not None:
+        run, wheels = self.run, {"t": np.asarray(self.run.times)}
+        for name, values in (("omega", run.rates), ("steer", run.steering)):
+            wheels |= {f"{name}_{index + 1}": column for index, column in enumerate(() if values is None else values.T)}
+        poses = {"t": run.pose_times} | dict(zip(("x", "y", "theta"), run.poses.T, strict=True))
+        tables = {"wheels": lambda: pl.DataFrame(wheels), "poses": lambda: pl.DataFrame(poses)}
+        if (references := run.references) is not None:
             tables["references"] = lambda: reference_frame([("", references)]).drop("trajectory")
         return tables
-
-    def _wheels(self) -> pl.DataFrame:
-        run = self.run
-        columns = {"t": np.asarray(run.times)} | {
-            f"omega_{index + 1}": rates for index, rates in enumerate(run.rates.T)
-        }
-        steering = () if run.steering is None else run.steering.T
-        return pl.DataFrame(columns | {f"steer_{index + 1}": angles for index, angles in enumerate(steering)})
-
-    def _poses(self) -> pl.DataFrame:
-        x, y, theta = self.run.poses.T
-        return pl.DataFrame({"t": self.run.pose_times, "x": x, "y": y, "theta": theta})
 
     def figures(self) -> Sequence[FigureGrid]:
         start = marks(START, 9, *self.run.start[None, :2].T, hover="start")

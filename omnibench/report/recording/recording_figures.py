@@ -13,15 +13,18 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.scans import Scanner, TrajectoryScans
 from omnibench.report.blocks import Figure, FigureGrid, LegendItem
 from omnibench.report.figures import START, joined, line, marks
-from omnibench.report.numbers import count, decimals_for, fixed, motion_in_words
+from omnibench.report.numbers import count, decimals_for, fixed
 from omnibench.report.style import INK, PALETTE, REFERENCE, THEORETICAL, plan, plot
 from omnibench.robot.kinematics import Array, Robot, compose, interpolated, seen_from
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
 _SHOWN = 4  # runs, where kinds of motion are not known
-_STRAIGHT = 1e-3  # rad/s; a slower turn counts as straight
-ON_THE_SPOT = "on the spot"
+KINDS = ("straight", "turning left", "turning right", "both ways", "on the spot")
+_TURNS = 0.35  # rad: a run that turns less in all is straight; chosen
+_ON_THE_SPOT = 0.5  # m a turn: a run that drives less turns on the spot, as seen from the wheels' reach; chosen
+_ONE_WAY = 0.8  # of all turning that is to one side; chosen
+_LOOKED_AT = 40  # poses by which a run's motion is told, so that the reference's noise does not count; chosen
 
 
 def describe(trajectory: Trajectory) -> str:
@@ -34,58 +37,41 @@ def describe(trajectory: Trajectory) -> str:
     return f"({speed}{math.degrees(trajectory.alpha):.0f}°, {turn} rad/s), {trajectory.id}"
 
 
+def kinds_of(runs: Sequence[Trajectory]) -> dict[str, list[int]]:
+    """Indices of the runs of each kind of motion, by their reference poses; runs without poses are of none."""
+    found: dict[str, list[int]] = {kind: [] for kind in KINDS}
+    for index, run in enumerate(runs):
+        if not run.has_poses:
+            continue
+        steps = np.diff(run.poses[evenly(len(run.poses), _LOOKED_AT)], axis=0)
+        way, turned = float(np.hypot(*steps[:, :2].T).sum()), float(np.abs(steps[:, 2]).sum())
+        left = float(steps[:, 2].clip(0).sum()) / turned if turned else 0.5
+        kind = "turning left" if left > _ONE_WAY else "turning right" if left < 1 - _ONE_WAY else "both ways"
+        if way < _ON_THE_SPOT * turned / math.tau:
+            kind = "on the spot"
+        found["straight" if turned < _TURNS else kind].append(index)
+    return {kind: indices for kind, indices in found.items() if indices}
+
+
 def representative_runs(dataset: Dataset) -> dict[str, Trajectory]:
-    """One run of each kind of motion (straight, turning left, turning right, on the spot), by a name that says which.
+    """One run of each kind of motion, by a name that says which.
 
     The run chosen of a kind has the median final position error of the design odometry. Where the data set has
-    scans, only runs with scans are chosen. Where commands are unknown or of one kind: runs spread over the recording.
+    scans, only runs with scans are chosen. Where all are of one kind: runs spread over the recording.
     """
     runs: Sequence[Trajectory] = dataset.trajectories
     if dataset.scans is not None:
         scanned = set(dataset.scans.trajectories)
         runs = [run for run in runs if run.id in scanned]
+    kinds = kinds_of(runs)
+    if len(kinds) < 2:
+        return {describe(run): run for run in (runs[index] for index in evenly(len(runs), _SHOWN))}
     design = OdometryModel.of_design(dataset.robot, "arc")
-    by_kind = {kind: _of_median_error(like, design) for kind, like in kinds_of(runs).items()}
-    if len(by_kind) > 1:
-        return {f"{kind}: {describe(run)}": run for kind, run in by_kind.items()}
-    return {describe(run): run for run in spread(runs)}
-
-
-def motion_titles(runs: Sequence[Trajectory]) -> dict[str, Trajectory]:
-    """Runs by their motions in words, with their names where motions are not known or alike."""
-    words = [motion_in_words(run.id, run.v, run.alpha, run.omega) for run in runs]
-    unique = len(set(words)) == len(words)
-    return {name if unique else f"{name}, {run.id}": run for name, run in zip(words, runs, strict=True)}
-
-
-def spread(runs: Sequence[Trajectory], number: int = _SHOWN) -> list[Trajectory]:
-    """Some runs, evenly spaced, the first and the last among them."""
-    return [runs[index] for index in evenly(len(runs), number)]
-
-
-def kinds_of(runs: Sequence[Trajectory]) -> dict[str, list[Trajectory]]:
-    """The runs of each kind of commanded motion; of turning ones only those at the highest rate."""
-    kinds: dict[str, list[Trajectory]] = {"straight": [], "turning left": [], "turning right": [], ON_THE_SPOT: []}
-    for run in runs:
-        if run.omega is None or run.alpha is None:
-            continue
-        turns = abs(run.omega) >= _STRAIGHT
-        if run.v == 0 and turns:
-            kinds[ON_THE_SPOT].append(run)
-        elif run.v != 0:
-            kinds["straight" if not turns else "turning left" if run.omega > 0 else "turning right"].append(run)
-    fastest = {kind: max((abs(run.omega or 0.0) for run in like), default=0.0) for kind, like in kinds.items()}
-    return {
-        kind: [run for run in like if kind == "straight" or math.isclose(abs(run.omega or 0.0), fastest[kind])]
-        for kind, like in kinds.items()
-        if like
-    }
-
-
-def _of_median_error(runs: Sequence[Trajectory], odometry: OdometryModel) -> Trajectory:
-    ends = odometry.poses([run.final_log for run in runs])
-    errors = [math.hypot(*(end[-1, :2] - run.final_pose[:2])) for end, run in zip(ends, runs, strict=True)]
-    return runs[int(np.argsort(errors)[(len(errors) - 1) // 2])]
+    posed = {index: runs[index] for like in kinds.values() for index in like}
+    ends = zip(posed.items(), design.poses([run.final_log for run in posed.values()]), strict=True)
+    errors = {index: math.hypot(*(end[-1, :2] - run.final_pose[:2])) for (index, run), end in ends}
+    middle = {kind: sorted(like, key=lambda index: errors[index])[(len(like) - 1) // 2] for kind, like in kinds.items()}
+    return {f"{kind}: {describe(runs[index])}": runs[index] for kind, index in middle.items()}
 
 
 SCANS, TRUTH, PLAN = "#7c8894", INK, "#b8977e"
@@ -130,16 +116,6 @@ def evenly(count: int, limit: int) -> Array:
     return picks
 
 
-def thinned(points: Array, limit: int, cell: float = 0.01) -> Array:
-    """At most ``limit`` of the points (n, 2): one for each occupied cell of a grid (``cell`` m), widened as needed."""
-    while True:
-        _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
-        if len(first) <= limit:
-            kept: Array = points[np.sort(first)]
-            return kept
-        cell *= 1.25
-
-
 # How much one figure draws (chosen: more cannot be told apart on a screen).
 _POINTS = 2500  # scan points
 _SCANS = 120  # scans of a run
@@ -170,21 +146,15 @@ def all_runs(dataset: Dataset, shown: Trajectory, outlines: Sequence[Array]) -> 
     items = [item]
     if dataset.scans is not None:
         room = [line(PLAN_ITEM, 1.5, *joined(outlines).T)] if outlines else []
-        points = seen_from(shown.start, thinned(run_points(dataset, shown), _POINTS))
+        scanner, scans = dataset.scans.scanner, dataset.scans.of(shown.id)
+        picks = evenly(len(scans.times), _SCANS)
+        points = np.vstack([scan_points(shown, scanner, scans, int(scan)) for scan in picks])
+        points = seen_from(shown.start, points[evenly(len(points), _POINTS)])
         room.append(marks(SCANS_ITEM, 2.5, *points.T, opacity=0.6))
         title = f"The room that {shown.id} saw"
         figures.append(Figure(title, _map([*room, *paths]), f"{title}, by its scans, with the paths of all runs", 340))
         items += [SCANS_ITEM, *([PLAN_ITEM] if outlines else [])]
     return FigureGrid(tuple(figures), tuple(items), 2, words, "paths")
-
-
-def run_points(dataset: Dataset, trajectory: Trajectory) -> Array:
-    """Scan points (n, 2) of a run, m, in the frame of its reference poses, from at most 120 scans."""
-    if dataset.scans is None:
-        return np.empty((0, 2))
-    scanner, scans = dataset.scans.scanner, dataset.scans.of(trajectory.id)
-    picks = evenly(len(scans.times), _SCANS)
-    return np.vstack([scan_points(trajectory, scanner, scans, int(scan)) for scan in picks])
 
 
 def _map(traces: Sequence[go.Scatter]) -> go.Figure:
@@ -195,7 +165,7 @@ def _map(traces: Sequence[go.Scatter]) -> go.Figure:
     return plan(*traces, window=window + margin * [-1, 1])
 
 
-_MEAN_OVER = 0.1  # s; also in the legends
+MEAN_OVER = 0.1  # s; also in the legends
 _DRAWN = 600  # means drawn at most (chosen: as fine as a screen shows)
 _ROW = 130  # px, height of a wheel's row
 _GAP = 0.06  # space between rows, as a share of the plot
@@ -203,46 +173,54 @@ _GAP = 0.06  # space between rows, as a share of the plot
 _MEAN = LegendItem("mean", "measured, mean over 100 ms", PALETTE[0])
 _TARGET = LegendItem("target", "target", INK, "dash")
 _STEERING = LegendItem("steering", "steering angle", PALETTE[3])
-_ERROR = LegendItem("error", "measured − target, mean over 100 ms", PALETTE[2])
 
 
-def wheel_rates(trajectory: Trajectory, robot: Robot) -> FigureGrid:
-    """Rates, targets and steering angles over time, a row for each wheel; with targets also the difference."""
-    times = trajectory.times
-    period = float(np.median(np.diff(times, prepend=0.0)))
-    size = max(1, round(_MEAN_OVER / period), -(-len(times) // _DRAWN))
-    starts = np.arange(0, len(times), size)
-    durations = np.diff(times, prepend=0.0)[:, None]
-    lengths = np.add.reduceat(durations, starts)
-    middles = np.append(0.0, times)[starts] + lengths[:, 0] / 2
+def means_before(run: Trajectory, values: Array, times: Array, over: float = MEAN_OVER) -> Array:
+    """Means (n, N) of the samples' values (F, N) over the time ``over`` before each of ``times`` (n,), s."""
+    ends = np.append(0.0, run.times)
+    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * np.diff(ends)[:, None], axis=0)])
+    late = np.clip(times, over / 2, ends[-1])
+    early = np.maximum(late - over, 0.0)
+    means: Array = (interpolated(late, ends, sums) - interpolated(early, ends, sums)) / (late - early)[:, None]
+    return means
 
-    def means(item: LegendItem, values: Array, width: float = 1.6, unit: str = " rad/s") -> list[go.Scatter]:
-        """Means of the columns of values (F, N) over blocks of samples, weighted by their durations."""
-        rows = np.round(np.add.reduceat(values * durations, starts) / lengths, 9).T  # an even rate stays even
+
+def wheel_rates(run: Trajectory, robot: Robot) -> FigureGrid:
+    """Rates with their targets, and steering angles, over time: a row for each wheel."""
+    end = float(run.times[-1])
+    over = max(MEAN_OVER, float(np.median(np.diff(run.times, prepend=0.0))), end / _DRAWN)
+    times = np.arange(over, end + 1e-9, over) if end > over else run.times[-1:]
+
+    def lines(item: LegendItem, values: Array, width: float, unit: str) -> list[go.Scatter]:
+        rows = np.round(means_before(run, values, times, over), 9).T  # an even rate stays even
         hover = f"{item.label}<br>%{{y:.3f}}{unit} at %{{x:.2f}} s"
-        return [line(item, width, middles, row, hover=hover) for row in rows]
+        return [line(item, width, times - over / 2, row, hover=hover) for row in rows]
 
-    rows = [[trace] for trace in means(_MEAN, trajectory.rates)]
-    items, titles = [_MEAN], [f"{name} (rad/s)" for name in robot.wheel_names]
-    figures = []
-    if trajectory.targets is not None:
-        for row, target in zip(rows, means(_TARGET, trajectory.targets, 1.2), strict=True):
+    rows = [[trace] for trace in lines(_MEAN, run.rates, 1.6, " rad/s")]
+    items, names, caption = [_MEAN], [f"{name} (rad/s)" for name in robot.wheel_names], ""
+    if run.targets is not None:
+        for row, target in zip(rows, lines(_TARGET, run.targets, 1.2, " rad/s"), strict=True):
             row.append(target)
-        error = trajectory.rates - trajectory.targets
-        rms = float(np.sqrt((error**2).mean()))
+        error = run.rates - run.targets
+        mean, rms = float(error.mean()), float(np.sqrt((error**2).mean()))
         decimals = decimals_for(rms, 2)
-        title = f"Measured − target: mean {fixed(float(error.mean()), decimals)}, RMS {fixed(rms, decimals)} rad/s"
-        differences = _stacked([[trace] for trace in means(_ERROR, error)], titles, float(times[-1]))
-        height = _ROW * len(rows) + 60
-        figures.append(Figure(title, differences, "Difference of measured rates and targets, a row a wheel", height))
-        items += [_TARGET, _ERROR]
-    if trajectory.steering is not None:
-        rows += [[trace] for trace in means(_STEERING, np.degrees(trajectory.steering), unit="°")]
-        titles += [f"{name} (°)" for name in robot.drive.steered]
+        caption = f"Measured − target: mean {fixed(mean, decimals)}, RMS {fixed(rms, decimals)} rad/s."
+        items.append(_TARGET)
+    if run.steering is not None:
+        rows += [[trace] for trace in lines(_STEERING, np.degrees(run.steering), 1.6, "°")]
+        names += [f"{name} (°)" for name in robot.drive.steered]
         items.append(_STEERING)
-    drawn = _stacked(rows, titles, float(times[-1]))
-    rates = Figure("Wheel rates", drawn, "Wheel rates over time, a row a wheel", _ROW * len(rows) + 60)
-    return FigureGrid((rates, *figures), tuple(items), 2 if figures else 1)
+    # Plots above each other with a common time axis
+    height = (1 + _GAP) / len(rows) - _GAP
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": "t (s)"}, "anchor": f"y{len(rows)}", "range": [0.0, end]}}
+    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        top = 1 - index * (height + _GAP)
+        layout[f"yaxis{index + 1}"] = {"domain": [max(0.0, top - height), top], "title": {"text": name}}
+        for trace in row:
+            trace.update(yaxis=f"y{index + 1}")
+    figure = plot(*(trace for row in rows for trace in row), **layout)
+    shown = Figure("Wheel rates", figure, "Wheel rates over time, a row a wheel", _ROW * len(rows) + 60)
+    return FigureGrid((shown,), tuple(items), 1, caption)
 
 
 def rate_step(trajectory: Trajectory) -> float | None:
@@ -254,18 +232,3 @@ def rate_step(trajectory: Trajectory) -> float | None:
     multiples = values / step
     # Ticks counted over periods that vary would not be multiples.
     return step if np.abs(multiples - np.round(multiples)).max() < 0.02 else None
-
-
-def _stacked(rows: Sequence[Sequence[go.Scatter]], titles: Sequence[str], end: float) -> go.Figure:
-    """Plots in rows above each other with a common time axis from 0 to ``end`` s."""
-    height = (1 + _GAP) / len(rows) - _GAP
-    layout: dict[str, Any] = {}
-    for index, (row, title) in enumerate(zip(rows, titles, strict=True)):
-        number = "" if index == 0 else str(index + 1)
-        top = 1 - index * (height + _GAP)
-        layout[f"yaxis{number}"] = {"domain": [max(0.0, top - height), top], "title": {"text": title}}
-        for trace in row:
-            trace.update(yaxis=f"y{number}")
-    last = "y" if len(rows) == 1 else f"y{len(rows)}"
-    traces = [trace for row in rows for trace in row]
-    return plot(*traces, xaxis={"title": {"text": "t (s)"}, "anchor": last, "range": [0.0, end]}, **layout)

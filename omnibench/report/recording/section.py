@@ -7,7 +7,8 @@ poses, wheel rates and scans of a run, rounded.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,24 +17,23 @@ import numpy as np
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.stored import drawn_runs
 from omnibench.data.true_poses import TruePath
-from omnibench.errors import DataError
 from omnibench.report import blocks
 from omnibench.report.figures import is_placed, joined, line
-from omnibench.report.numbers import NOTHING, count, fixed, listing, significant
+from omnibench.report.numbers import NOTHING, count, fixed, significant
 from omnibench.report.recording import recording_figures
 from omnibench.report.result import NextStep, Remark, Result
-from omnibench.report.style import INK, PALETTE, plot
+from omnibench.report.style import plot
 from omnibench.robot.kinematics import Array, compose, interpolated, placed, seen_from
 from omnibench.robot.model import OdometryModel
 from omnibench.slam.slam_dataset import SlamAccuracy, SlamResult, SlamSummary, run_errors, slam_accuracy
 from omnibench.words import kind_of_data, plural
 
 _FRAMES = 200  # frames drawn of a run (chosen: steps of the slider that can be told apart)
-_MEAN_OVER = 0.1  # s; wheel rates are means over this time before each frame
 _SCANS = 30  # scans drawn of a run (chosen: keeps the file small)
 _RAYS = 180  # rays drawn of a scan (chosen: keeps the file small)
 _MARGIN = 0.4  # m around everything that is drawn
 _SEEN = blocks.LegendItem("scan", "this moment's scan", "#d97706")
+_SEEN_BEFORE = blocks.LegendItem("map", "earlier scans", recording_figures.SCANS_ITEM.colour)
 
 
 def player(
@@ -47,12 +47,9 @@ def player(
 
     outlines: for each run the walls of the floor plan in the frame of its reference poses, each (n, 2), m.
     """
-    shown = ["the robot"]
-    shown += ["its last scan, and what it saw before"] if dataset.scans is not None else []
-    shown += ["the path so far and its wheel rates"]
     return blocks.Player(
         {name: _run(dataset, run, odometry, truth.get(run.id), outlines.get(run.id, ())) for name, run in runs.items()},
-        f"A plan of the room with {listing(shown)}, at the time that the slider names",
+        "The robot from above with what it saw, its path so far and its wheel rates, at the time of the slider",
         "Between reference poses the robot is drawn on a straight line; wheel rates are means over the 100 ms before. "
         "With the slider in focus the arrow keys go step by step.",
     )
@@ -61,27 +58,30 @@ def player(
 def _run(
     dataset: Dataset, run: Trajectory, odometry: OdometryModel, truth: TruePath | None, outlines: Sequence[Array]
 ) -> dict[str, Any]:
-    end, steered = run.end, dataset.robot.drive.steered
-    times = np.linspace(0.0, end, min(_FRAMES, max(2, round(end / 0.02) + 1)))
+    times = np.linspace(0.0, run.end, min(_FRAMES, max(2, round(run.end / 0.02) + 1)))
     poses = recording_figures.poses_at(run, times)
     (driven,) = odometry.poses([run.log(times)])
-    true_poses = None if truth is None else placed(run.start, truth.at(times))
-    scans = _played_scans(dataset, run)
-    rates = _means(run, run.rates, times)
-    targets = None if run.targets is None else _means(run, run.targets, times)
-    everything = [rates] if targets is None else [rates, targets]
-    drawn = [poses[:, :2], driven[:, :2], *outlines, *(np.reshape(scan["points"], (-1, 2)) for scan in scans)]
+    scans = list(_played_scans(dataset, run))
+    told = [values for values in (run.rates, run.targets) if values is not None]
+    rates = [recording_figures.means_before(run, values, times) for values in told]
     # Left, bottom, right and top of the picture, m; the farthest 0.5 % of the points on each side are cut off
-    points = np.vstack(drawn)
+    points = np.vstack(
+        [poses[:, :2], driven[:, :2], *outlines, *(np.reshape(scan["points"], (-1, 2)) for scan in scans)]
+    )
     low, high = np.quantile(points, 0.005, axis=0) - _MARGIN, np.quantile(points, 0.995, axis=0) + _MARGIN
+    steered = dataset.robot.drive.steered
+    shown = [recording_figures.REFERENCE_ITEM, recording_figures.ODOMETRY_ITEM]
+    shown += [recording_figures.TRUTH_ITEM] if truth is not None else []
+    shown += [recording_figures.PLAN_ITEM] if outlines else []
+    shown += [_SEEN, _SEEN_BEFORE] if scans else []
     return {
         "times": _rounded(times),
         "poses": _rounded(poses, 4),
         "odometry": _rounded(driven[:, :2]),
-        "truth": None if true_poses is None else _rounded(true_poses),
-        "rates": _rounded(rates),
-        "targets": None if targets is None else _rounded(targets),
-        "rate_limit": round(1.05 * max(float(np.abs(np.vstack(everything)).max()), 1e-3), 3),
+        "truth": None if truth is None else _rounded(placed(run.start, truth.at(times))),
+        "rates": _rounded(rates[0]),
+        "targets": None if run.targets is None else _rounded(rates[1]),
+        "rate_limit": round(1.05 * max(float(np.abs(rates).max()), 1e-3), 3),
         "scans": scans,
         "plan": [_rounded(outline) for outline in outlines],
         "window": _rounded(np.concatenate([low, high])),
@@ -99,59 +99,20 @@ def _run(
             if is_placed(wheel)
         ],
         "radius": max(math.hypot(wheel.reach, wheel.radius) for wheel in dataset.robot.wheels),
-        "colours": {
-            "reference": recording_figures.REFERENCE_ITEM.colour,
-            "odometry": recording_figures.ODOMETRY_ITEM.colour,
-            "truth": recording_figures.TRUTH_ITEM.colour,
-            "plan": recording_figures.PLAN_ITEM.colour,
-            "map": recording_figures.SCANS + "66",
-            "scan": _SEEN.colour,
-            "ray": _SEEN.colour + "44",
-            "whole": recording_figures.REFERENCE_ITEM.colour + "55",
-            "robot": INK,
-        },
-        "key": _key(bool(scans), truth is not None, bool(outlines)),
+        "key": [{"name": item.key, "label": item.label, "colour": item.colour} for item in shown],
     }
 
 
-def _played_scans(dataset: Dataset, run: Trajectory) -> list[dict[str, Any]]:
+def _played_scans(dataset: Dataset, run: Trajectory) -> Iterator[dict[str, Any]]:
     """Some scans of a run: stamp, scanner position, and points as x, y, x, y, ..., m."""
     if dataset.scans is None or run.id not in dataset.scans.trajectories:
-        return []
+        return
     scanner, scans = dataset.scans.scanner, dataset.scans.of(run.id)
-    stride = -(-scanner.rays // _RAYS)
-    documents = []
     for scan in recording_figures.evenly(len(scans.times), _SCANS):
         stamp = scans.times[scan]
         origin = compose(recording_figures.poses_at(run, stamp), scanner.mount.pose)
-        points = recording_figures.scan_points(run, scanner, scans, int(scan), stride)
-        documents.append(
-            {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}
-        )
-    return documents
-
-
-def _means(run: Trajectory, values: Array, times: Array) -> Array:
-    """Mean rates (n, N) over the 0.1 s before each of ``times`` (n,), s; values (F, N): the rate of each sample."""
-    ends = np.append(0.0, run.times)
-    durations = np.diff(ends)[:, None]
-    angles = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * durations, axis=0)])
-    late = np.clip(times, _MEAN_OVER / 2, ends[-1])
-    early = np.maximum(late - _MEAN_OVER, 0.0)
-    driven = interpolated(late, ends, angles) - interpolated(early, ends, angles)
-    means: Array = driven / (late - early)[:, None]
-    return means
-
-
-def _key(scans: bool, truth: bool, plan: bool) -> list[dict[str, Any]]:
-    items = (
-        [recording_figures.REFERENCE_ITEM, recording_figures.ODOMETRY_ITEM]
-        + [recording_figures.TRUTH_ITEM] * truth
-        + [recording_figures.PLAN_ITEM] * plan
-    )
-    points = [_SEEN, blocks.LegendItem("map", "earlier scans", recording_figures.SCANS_ITEM.colour)] * scans
-    entries: list[dict[str, Any]] = [{"label": item.label, "colour": item.colour, "points": False} for item in items]
-    return entries + [{"label": item.label, "colour": item.colour, "points": True} for item in points]
+        points = recording_figures.scan_points(run, scanner, scans, int(scan), -(-scanner.rays // _RAYS))
+        yield {"t": round(float(stamp), 4), "from": _rounded(origin[:2]), "points": _rounded(points.ravel())}
 
 
 def _rounded(values: Array, decimals: int = 3) -> Any:
@@ -170,7 +131,15 @@ class ReferencePosesResult(Result):
 
     def tables(self) -> Sequence[blocks.Table]:
         summary = self.result.summary
-        return [summary_table(summary), *([error_table(summary.accuracy)] if summary.accuracy is not None else [])]
+        stated = {name.replace("_deviation", ""): each for name, each in summary if "_deviation_" in name}
+        columns = {"stated deviation at a run's end": stated}
+        if summary.recorded is not None:
+            columns["distance from the recorded reference"] = summary.recorded.model_dump()
+        note = f"{plural(summary.runs, 'run')}, {plural(summary.scans, 'scan')}; {summary.matched_mean:.1%} of the "
+        note += f"points matched (worst scan {summary.matched_min:.0%})"
+        title = f"{summary.dataset}, {kind_of_data(summary.simulated)}: reference poses from the scans"
+        errors = [] if summary.accuracy is None else [error_table(summary.accuracy)]
+        return [field_table(title, columns, note), *errors]
 
     def remarks(self) -> Sequence[Remark]:
         written = {"report": self.report, plural(self.result.summary.runs, "trajectory"): self.poses}
@@ -191,59 +160,29 @@ class ReferencePosesResult(Result):
         return self.result.summary
 
 
+def field_table(caption: str, columns: Mapping[str, Mapping[str, float | None]], note: str = "") -> blocks.Table:
+    """Numbers by the names of their fields, whose endings give the unit: a row a field, a column each."""
+    rows = []
+    for name in dict.fromkeys(name for numbers in columns.values() for name in numbers):
+        values = [numbers.get(name) for numbers in columns.values()]
+        words, _, ending = name.rpartition("_")
+        small = all(abs(value) < 1 for value in values if value is not None)
+        units = {"m": (1e3, "mm") if small else (1.0, "m"), "rad": (math.degrees(1.0), "°"), "s": (1.0, "s")}
+        factor, unit = units.get(ending, (1.0, ""))
+        heading = f"{words} ({unit})" if unit else name
+        scaled = (value if value is None or isinstance(value, int) else factor * value for value in values)
+        shown = (count(each) if isinstance(each, int) else significant(each) for each in scaled)
+        rows.append(blocks.Row.of(heading.replace("_", " "), *shown))
+    return blocks.Table(caption, blocks.columns("", *columns), tuple(rows), note)
+
+
 def error_table(accuracy: SlamAccuracy) -> blocks.Table:
     """The errors of reference poses against the truth: of the last pose of each run, and of all poses."""
-    final, every = accuracy.final, accuracy.every
-
-    def row(name: str, scale: float, *fields: str) -> blocks.Row:
-        values = [getattr(of_poses, field) if field else None for of_poses in (final, every) for field in fields]
-        signed = fields[0].startswith("bias")
-        shown = (NOTHING if value is None else significant(scale * value, 2, signed) for value in values)
-        return blocks.Row.of(name, *shown)
-
-    degrees = math.degrees(1.0)
-    rows = (
-        row("position (mm)", 1e3, *(f"position_{which}_m" for which in ("mean", "p95", "max"))),
-        row("heading (°)", degrees, *(f"heading_{which}_rad" for which in ("mean", "p95", "max"))),
-        row("forward, signed (mm)", 1e3, "bias_forward_m", "", ""),
-        row("to the left, signed (mm)", 1e3, "bias_left_m", "", ""),
-        row("heading, signed (°)", degrees, "bias_heading_rad", "", ""),
-        row("NEES", 1.0, "nees_mean", "", ""),
-    )
-    drift = f"{_mm(accuracy.drift_position)} mm and {_degrees(accuracy.drift_heading)}° per metre"
-    columns = [
-        blocks.Column(f"{poses}, {which}", priority=int(which != "mean"))
-        for poses in ("last poses", "all poses")
-        for which in ("mean", "95 %", "worst")
-    ]
-    return blocks.Table(
-        "Errors of the reference poses against the truth",
-        (blocks.Column("error", numeric=False), *columns),
-        rows,
-        f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all; drift {drift}. NEES: squared "
-        "error over the stated covariance, 3 where that is right.",
-    )
-
-
-def summary_table(summary: SlamSummary) -> blocks.Table:
-    """The deviations that SLAM states, and the distances from the reference poses that were recorded."""
-    deviations = (_mm(summary.position_deviation_mean_m), NOTHING, _mm(summary.position_deviation_max_m))
-    turns = (_degrees(summary.heading_deviation_mean_rad), NOTHING, _degrees(summary.heading_deviation_max_rad))
-    rows = [blocks.Row.of("deviation stated at the end of a run", *deviations, *turns)]
-    if (known := summary.recorded) is not None:
-        lengths = (_mm(known.position_mean_m), _mm(known.position_p95_m), NOTHING)
-        angles = (_degrees(known.heading_mean_rad), _degrees(known.heading_p95_rad), NOTHING)
-        name = blocks.Cell("distance from the recorded reference", plural(known.poses, "pose"))
-        rows.append(blocks.Row.of(name, *lengths, *angles))
-    columns = (
-        blocks.Column("Poses", numeric=False),
-        *(blocks.Column(f"position, {which}", "mm") for which in ("mean", "95 %", "worst")),
-        *(blocks.Column(f"heading, {which}", "°") for which in ("mean", "95 %", "worst")),
-    )
-    counts = f"{plural(summary.runs, 'run')}, {plural(summary.scans, 'scan')}"
-    matched = f"{summary.matched_mean:.1%} of the points matched (worst scan {summary.matched_min:.0%})"
-    title = f"{summary.dataset}, {kind_of_data(summary.simulated)}: reference poses from the scans"
-    return blocks.Table(title, columns, tuple(rows), f"{counts}; {matched}")
+    note = f"{plural(accuracy.runs, 'run')}, {significant(accuracy.distance_m, 4)} m in all; drift "
+    note += f"{_mm(accuracy.drift_position)} mm and {_degrees(accuracy.drift_heading)}° per metre. NEES: squared error "
+    note += "over the stated covariance, 3 where that is right. p95: 95 % are smaller."
+    both = {"last poses": accuracy.final.model_dump(), "all poses": accuracy.every.model_dump()}
+    return field_table("Errors of the reference poses against the truth", both, note)
 
 
 def _mm(metres: float) -> str:
@@ -254,112 +193,102 @@ def _degrees(angle: float) -> str:
     return significant(math.degrees(angle), 2)
 
 
+def reference_kinds(dataset: Dataset) -> Counter[str]:
+    """How many references there are other than poses, by kind."""
+    told = (run.references for run in dataset.trajectories)
+    return Counter(kind for references in told if references is not None for kind in references.kinds.tolist())
+
+
 def contents_table(dataset: Dataset) -> blocks.Table:
-    """A table of the quantities from motion command to SLAM pose: recorded or not, how many, at what interval."""
+    """The quantities from motion command to reference pose, recorded or not, how many and at what interval."""
     runs, scans = dataset.trajectories, dataset.scans
     rows = []
 
-    def add(name: str, symbol: str, recorded: Sequence[Any], times: Sequence[Array], noun: str, remark: str) -> None:
+    def add(name: str, symbol: str, recorded: Sequence[Any], stamps: Sequence[Array], noun: str, remark: str) -> None:
         if not recorded:
             rows.append(blocks.Row.of(blocks.Cell(name, symbol), "not recorded", NOTHING, "", role="muted"))
             return
         if len(recorded) < len(runs):
             remark += f"; in {count(len(recorded))} of {count(len(runs))} runs"
-        number = sum(run.samples.count for run in recorded) if noun == "samples" else sum(map(len, times))
-        every = _every(times) if noun != "runs" else NOTHING
+        number = sum(run.samples.count for run in recorded) if noun == "samples" else sum(map(len, stamps))
+        gaps = 1e3 * np.concatenate([np.diff(of_run) for of_run in stamps])
+        every = NOTHING
+        if gaps.any():
+            low, every, high = (significant(float(gap), 3) for gap in np.quantile(gaps, [0.01, 0.5, 0.99]))
+            every += " ms" if low == high else f" ms ({low} to {high})"
         rows.append(blocks.Row.of(blocks.Cell(name, symbol), f"{count(number)} {noun}", every, remark))
 
     def having(field: str) -> list[Trajectory]:
         return [run for run in runs if getattr(run, field) is not None]
 
-    def stamps(some: Sequence[Trajectory]) -> list[Array]:
-        return [np.append(0.0, run.times) for run in drawn_runs(some)] if some else []
-
     commanded, sent = having("omega"), [run for run in having("sent") if len(run.sent or ())]
-    different = len({(run.v, run.alpha, run.omega) for run in commanded})
-    add(
-        "Motion command", "(v, α, ω, d)", commanded, [np.zeros(len(commanded))], "runs", f"{count(different)} different"
-    )
+    different = f"{count(len({(run.v, run.alpha, run.omega) for run in commanded}))} different"
+    add("Motion command", "v, α, ω, d", commanded, [np.zeros(len(commanded))], "runs", different)
     orders = [np.asarray(run.sent)[:, 0] for run in sent]
-    add("Sent commands", "(v, α, ω, t_r)", sent, orders, "commands", "as the robot was sent them")
-    step = recording_figures.rate_step(runs[0])
+    add("Sent commands", "v, α, ω, t_r", sent, orders, "commands", "as the robot was sent them")
+    step, wheels = recording_figures.rate_step(runs[0]), ", ".join(dataset.robot.wheel_names)
     ticks = "by encoders" if step is None else f"by encoders, in steps of {significant(step, 3)} rad/s"
     for name, symbol, field, remark in (
         ("Target wheel rates", "ωM", "targets", "what the motor controllers were told"),
-        ("Measured wheel rates", "ω", "rates", ticks),
+        ("Measured wheel rates", "ω", "rates", f"{wheels}; {ticks}"),
         ("Wheel angles", "φ", "angles", "absolute, continuous within a session"),
         ("Steering angles", "steer", "steering", "at the samples' ends"),
-        ("Odometry of the robot", "(x, y, θ)", "odometry", "as it computed it"),
+        ("Odometry of the robot", "x, y, θ", "odometry", "as it computed it"),
     ):
         recorded = list(runs) if field == "rates" else having(field)
         if recorded or field != "steering":
-            add(name, symbol, recorded, stamps(recorded), "samples", remark)
-    scanned = [] if scans is None else list(scans.trajectories)
-    device = ""
+            drawn = drawn_runs(recorded) if recorded else []
+            add(name, symbol, recorded, [np.append(0.0, run.times) for run in drawn], "samples", remark)
+    scanned, device = list[str](), ""
     if scans is not None:
-        turn = np.degrees(abs(scans.scanner.angle_increment) * (scans.scanner.rays - 1))
-        device = f"{scans.scanner.name}: " if scans.scanner.name else ""
-        device += (
-            f"{count(scans.scanner.rays)} ranges over {significant(float(turn), 3)}°, to {scans.scanner.range_max:g} m"
-        )
-    times = [] if scans is None else [scans.times(run) for run in scanned]
-    add("LIDAR scans", "LIDAR", scanned, times, "scans", device)
+        scanned, scanner = list(scans.trajectories), scans.scanner
+        turn = math.degrees(abs(scanner.angle_increment) * (scanner.rays - 1))
+        device = f"{scanner.name}: " if scanner.name else ""
+        device += f"{count(scanner.rays)} ranges over {significant(turn, 3)}°, to {scanner.range_max:g} m"
+    add("LIDAR scans", "", scanned, [scans.times(run) for run in scanned] if scans else [], "scans", device)
     covariances = "with covariances" if len(having("pose_covariances")) == len(runs) else "without covariances"
-    symbol = "(x, y, θ)" if scans is None else "(x, y, θ) LIDAR"
-    add("Reference poses", symbol, runs, [run.pose_times for run in runs], "poses", covariances)
-    columns = (
-        blocks.Column("Recorded", numeric=False),
-        blocks.Column("Number"),
-        blocks.Column("Every"),
-        blocks.Column("Remarks", numeric=False),
-    )
-    note = "Every: the median interval; where they vary, in brackets the range that holds 98 % of them."
-    return blocks.Table("What was recorded", columns, tuple(rows), note)
+    posed, symbol = [run for run in runs if run.start_known], "x, y, θ" if scans is None else "x, y, θ by LIDAR"
+    add("Reference poses", symbol, posed, [run.pose_times for run in posed], "poses", covariances)
+    for kind, number in reference_kinds(dataset).items():
+        rows.append(blocks.Row.of(f"References: {kind}", count(number), NOTHING, ""))
+    columns = blocks.columns("Recorded", "Number", "Every", blocks.Column("Remarks", numeric=False))
+    named = {"": dataset.description, "source: ": dataset.source, "licence: ": dataset.licence}
+    note = "; ".join(f"{name}{text}" for name, text in named.items() if text)
+    title = f"{dataset.name}, robot {dataset.robot.name}: {kind_of_data(dataset.simulated)}"
+    return blocks.Table(title, columns, tuple(rows), note)
 
 
-def _every(times: Sequence[Array]) -> str:
-    """The interval between stamps in words."""
-    gaps = 1e3 * np.concatenate([np.diff(run) for run in times])
-    if not len(gaps):
-        return NOTHING
-    low, middle, high = (significant(float(gap), 3) for gap in np.quantile(gaps, [0.01, 0.5, 0.99]))
-    return f"{middle} ms" if low == high else f"{middle} ms ({low} to {high})"
+def tiles(dataset: Dataset, metres: float) -> list[blocks.Fact]:
+    """What was recorded, in numbers. metres: driven in all."""
+    runs, kinds = dataset.trajectories, reference_kinds(dataset)
+    poses = sum(len(run.poses) for run in runs if run.start_known)
+    splits = Counter(run.split for run in runs)
+    samples = count(sum(run.samples.count for run in runs))
+    return [
+        blocks.Fact("Runs", count(len(runs)), ", ".join(f"{number} {split}" for split, number in splits.items())),
+        blocks.Fact("Driven", f"{significant(metres, 3)} m", f"in {fixed(sum(run.end for run in runs) / 60, 1)} min"),
+        blocks.Fact("Wheel samples", f"every {significant(1e3 * dataset.sample_period, 3)} ms", samples),
+        blocks.Fact("References", count(poses + kinds.total()), ", ".join(kinds) or "poses"),
+    ]
 
 
-_RUNS = 50  # runs drawn as thin lines (chosen)
-_BINS = 16  # bins of distance (chosen)
-_LEAST = 5  # poses; a bin with fewer shows no mean (chosen)
-_RUN = blocks.LegendItem("run", "a run", "#c3c9d0")
-_MEAN = blocks.LegendItem("mean", "mean", PALETTE[0])
-_HIGH = blocks.LegendItem("high", "95th percentile", PALETTE[2], "dash")
+_RUNS = 50  # runs whose errors are drawn (chosen)
 
 
 def error_figures(dataset: Dataset, truth: Mapping[str, TruePath]) -> blocks.FigureGrid:
     """The errors of the reference poses over the distance driven; the true path of every run must be known."""
-    errors = [run_errors(run, truth[run.id]) for run in dataset.trajectories]
-    drawn = [errors[index] for index in recording_figures.evenly(len(errors), _RUNS)]
-    way = np.concatenate([run.driven for run in errors])
-    edges = np.linspace(0.0, float(way.max()) * (1 + 1e-9) or 1.0, _BINS + 1)
-    bin_of = np.digitize(way, edges) - 1
-    bins = [index for index in range(_BINS) if (bin_of == index).sum() >= _LEAST]
-    middles = np.array([float(way[bin_of == index].mean()) for index in bins])
-    figures = []
+    runs = dataset.trajectories
+    drawn = [run_errors(runs[index], truth[runs[index].id]) for index in recording_figures.evenly(len(runs), _RUNS)]
+    item, figures = recording_figures.REFERENCE_ITEM, []
     for name, field, unit, scale in (
         ("Position error", "position", "mm", 1e3),
         ("Heading error", "heading", "°", math.degrees(1.0)),
     ):
-        lines = joined([np.column_stack([run.driven, scale * getattr(run, field)]) for run in drawn])
-        values = scale * np.concatenate([getattr(run, field) for run in errors])
-        traces = [line(_RUN, 0.8, *lines.T, opacity=0.6)]
-        for item, share in ((_MEAN, None), (_HIGH, 0.95)):
-            parts = [values[bin_of == index] for index in bins]
-            levels = np.array([part.mean() if share is None else np.quantile(part, share) for part in parts])
-            traces.append(line(item, 2.4, middles, levels, hover=f"{item.label} %{{y:.3g}} {unit} at %{{x:.2f}} m"))
-        figure = plot(*traces, x_title="distance driven (m)", y_title=f"{name.lower()} ({unit})")
+        lines = joined([np.column_stack([errors.driven, scale * getattr(errors, field)]) for errors in drawn])
+        figure = plot(line(item, 1, *lines.T), x_title="distance driven (m)", y_title=f"{name.lower()} ({unit})")
         figure.update_yaxes(rangemode="tozero")
-        title = f"{name} over the distance driven"
-        figures.append(blocks.Figure(title, figure, f"{title} of every run, with mean and 95th percentile", 320))
-    return blocks.FigureGrid(tuple(figures), (_RUN, _MEAN, _HIGH), 2, "", "slam-errors")
+        figures.append(blocks.Figure(f"{name} over the distance driven", figure, f"{name} of every run", 320))
+    return blocks.FigureGrid(tuple(figures), name="slam-errors")
 
 
 class RoomPlan(Protocol):
@@ -383,64 +312,41 @@ def recording_document(
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
     accuracy: SlamAccuracy | None = None,
-    notes: Sequence[str] = (),
 ) -> blocks.Document:
     """The report on a recording as blocks: its contents, the room, the wheels, a run step by step.
 
     For simulated data: truth: true path of each run, which the reference poses are compared with. plan: the room.
     starts: true start pose (3,) of each run in that room, m, m, rad (default: the plan's start). accuracy: errors of
-    the reference poses (default: computed from the truth). notes: remarks at the top of the report.
+    the reference poses where the truth is not at hand.
 
     DataError in one line: broken scans, or a truth of other runs.
     """
     known = truth or {}
-    for run in dataset.trajectories if known else ():
-        if run.id not in known:
-            raise DataError(
-                f"data set {dataset.name}: run {run.id} is not in the truth; name the truth of this data set"
-            )
-    if known and accuracy is None:
-        accuracy = slam_accuracy(dataset, known)
-    runs = dataset.trajectories
-    seconds = sum(run.end for run in runs)
-    metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in runs)
-    length, minutes = f"{significant(metres, 3)} m", f"{fixed(seconds / 60, 1)} min"
-    sentence = f"{plural(len(runs), 'run')} of {dataset.robot.name}, {length} in {minutes}."
-    tiles = [
-        blocks.Fact("Runs", count(len(runs))),
-        blocks.Fact("Driven", length, f"in {minutes}"),
-        blocks.Fact("Wheel samples", f"every {significant(1e3 * dataset.sample_period, 3)} ms"),
-        blocks.Fact("Reference poses", count(sum(len(run.poses) for run in runs))),
-    ]
-    sections = []
+    accuracy = slam_accuracy(dataset, known) if known else accuracy
+    metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in dataset.trajectories)
+    facts, compared = tiles(dataset, metres), list[blocks.Section]()
     if accuracy is not None:
-        final = accuracy.final
-        errors = f"{_mm(final.position_mean_m)} mm and {_degrees(final.heading_mean_rad)}°"
-        sentence += f" Mean error of their last reference pose against the truth: {errors}."
-        tiles[2:] = [
-            blocks.Fact("Position error", f"{_mm(final.position_mean_m)} mm", "of the last pose, mean"),
-            blocks.Fact("Heading error", f"{_degrees(final.heading_mean_rad)}°", "of the last pose, mean"),
+        final, of = accuracy.final, "of the last pose against the truth, mean"
+        facts[2:] = [
+            blocks.Fact("Position error", f"{_mm(final.position_mean_m)} mm", of),
+            blocks.Fact("Heading error", f"{_degrees(final.heading_mean_rad)}°", of),
         ]
         shown = (*((error_figures(dataset, known),) if known else ()), error_table(accuracy))
-        about = "Errors of the reference poses over the distance driven, and whether their covariances are right."
-        sections.append(blocks.Section("slam", "SLAM against the truth", shown, about=about))
+        compared = [blocks.Section("slam", "SLAM against the truth", shown)]
     answer = blocks.answer_section(
-        sentence,
-        tiles,
+        f"{plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}, {facts[1].value} {facts[1].note}.",
+        facts,
         path_overview(dataset, plan, starts),
-        blocks.Callout("Before you rely on it", tuple(notes)),
         blocks.Callout("Warnings on reading the data", dataset.warnings, "warning"),
     )
-    contents = (contents_table(dataset), about_table(dataset))
-    about = "Quantities, numbers and intervals, from motion command to reference pose."
     return blocks.Document(
         f"Recording: {dataset.name}",
         dataset.description,
         (
             answer,
-            *sections,
-            *pictures(dataset, truth=known, plan=plan, starts=starts),
-            blocks.Section("recorded", "What was recorded", contents, about=about),
+            *compared,
+            *pictures(dataset, known, plan, starts),
+            blocks.Section("recorded", "What was recorded", (contents_table(dataset),)),
         ),
         blocks.simulated_badge(dataset.simulated),
     )
@@ -461,52 +367,29 @@ def has_recording(dataset: Dataset) -> bool:
 
 def recording_section(dataset: Dataset) -> blocks.Section:
     """The section on a recording for another report. DataError in one line: broken scans."""
-    paths = blocks.Section("recording-paths", "Paths of all runs", (path_overview(dataset),))
-    parts = (paths, *pictures(dataset, prefix="recording-"))
-    about = "What was recorded, all paths, wheel rates, and runs step by step."
-    return blocks.Section("recording", "Recording", (contents_table(dataset),), parts, about=about, folded=True)
-
-
-def about_table(dataset: Dataset) -> blocks.Facts:
-    """Name, source, licence and robot of a data set."""
-    facts = [
-        blocks.Fact("Data set", dataset.name, "simulated" if dataset.simulated else ""),
-        blocks.Fact("Description", dataset.description),
-        blocks.Fact("Source", dataset.source),
-        blocks.Fact("Licence", dataset.licence),
-        blocks.Fact("Robot", dataset.robot.name),
-    ]
-    return blocks.Facts(tuple(fact for fact in facts if fact.value))
+    return blocks.Section("recording", "Recording", (path_overview(dataset), contents_table(dataset)), folded=True)
 
 
 def pictures(
     dataset: Dataset,
-    *,
-    prefix: str = "",
     truth: Mapping[str, TruePath] | None = None,
     plan: RoomPlan | None = None,
     starts: Mapping[str, Array] | None = None,
 ) -> list[blocks.Section]:
     """The sections on single runs: played step by step, and their wheel rates."""
-    known, begun = truth or {}, starts or {}
-    runs = recording_figures.representative_runs(dataset)
-    odometry = OdometryModel.of_design(dataset.robot, "arc")
+    begun, runs = starts or {}, recording_figures.representative_runs(dataset)
     walls = {
         run.id: [placed(run.start, outline) for outline in _outlines(plan, begun.get(run.id))] for run in runs.values()
     }
-    exact = plan is None or all(run.id in begun for run in runs.values())
-    words = (
-        "" if plan is None else f"The floor plan ({plan.name}) is drawn from the robot's mark; for a run that began "
-    )
-    words += "beside the mark it is shifted by that distance."
-    played = (player(dataset, runs, odometry, known, walls), *(() if exact else (blocks.Paragraph(words, "note"),)))
+    odometry = OdometryModel.of_design(dataset.robot, "arc")
+    played: tuple[blocks.Block, ...] = (player(dataset, runs, odometry, truth or {}, walls),)
+    if plan is not None and not all(run.id in begun for run in runs.values()):
+        inexact = f"The floor plan ({plan.name}) is drawn from the robot's mark, wherever a run began."
+        played += (blocks.Paragraph(inexact, "note"),)
     rates = {name: (recording_figures.wheel_rates(run, dataset.robot),) for name, run in runs.items()}
-    about = "A run of each kind of motion, played: robot, paths, scans, wheel rates."
     return [
-        blocks.Section(f"{prefix}player", "Step by step", played, about=about),
-        blocks.Section(
-            f"{prefix}wheels", "Wheel rates", (blocks.Choice("Run", rates),), about="Measured, and as told."
-        ),
+        blocks.Section("player", "Step by step", played),
+        blocks.Section("wheels", "Wheel rates", (blocks.Choice("Run", rates),)),
     ]
 
 

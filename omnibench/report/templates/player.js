@@ -1,7 +1,7 @@
 "use strict";
 
 // A player draws one run of a robot at the time that its range input names. What it reads is made by
-// recording/player.py: lengths in m, angles in rad, rates in rad/s; every list of a run has one entry a frame.
+// recording/section.py: lengths in m, angles in rad, rates in rad/s; every list of a run has one entry a frame.
 function startPlayer(player) {
   const runs = Object.values(JSON.parse(document.getElementById(player.dataset.source).textContent));
   const canvas = player.querySelector("canvas"), wheels = player.querySelector(".wheels");
@@ -13,6 +13,7 @@ function startPlayer(player) {
   function load() {
     stop();
     run = runs[chosen.selectedIndex];
+    run.colours = Object.fromEntries(run.key.map(({ name, colour }) => [name, colour]));
     slider.max = run.times.length - 1;
     slider.value = 0;
     key.replaceChildren(...run.key.map(legendEntry));
@@ -63,10 +64,10 @@ function startPlayer(player) {
   load();
 }
 
-function legendEntry({ label, colour, points }) {
+function legendEntry({ name, label, colour }) {
   const entry = document.createElement("span");
   entry.textContent = label;
-  entry.className = points ? "points" : "";
+  entry.className = ["scan", "map"].includes(name) ? "points" : "";
   entry.style.setProperty("--colour", colour);
   return entry;
 }
@@ -130,7 +131,7 @@ function drawRoom(canvas, run, frame, near) {
 
   for (const outline of run.plan) line(outline, run.colours.plan, 1.5);
   const past = run.scans.filter((scan) => scan.t <= run.times[frame]);
-  past.slice(0, -1).forEach((scan) => dots(scan.points, run.colours.map, 1.5));
+  past.slice(0, -1).forEach((scan) => dots(scan.points, run.colours.map + "66", 1.5));
   const current = past[past.length - 1];
   if (current) {
     pen.beginPath();
@@ -138,12 +139,12 @@ function drawRoom(canvas, run, frame, near) {
       pen.moveTo(...place(...current.from));
       pen.lineTo(...place(current.points[i], current.points[i + 1]));
     }
-    pen.strokeStyle = run.colours.ray;
+    pen.strokeStyle = run.colours.scan + "44";
     pen.lineWidth = 0.6;
     pen.stroke();
     dots(current.points, run.colours.scan, 2.4);
   }
-  line(run.poses, run.colours.whole, 1);
+  line(run.poses, run.colours.reference + "55", 1);
   line(run.odometry.slice(0, frame + 1), run.colours.odometry, 2, [6, 4]);
   if (run.truth) line(run.truth.slice(0, frame + 1), run.colours.truth, 1.5, [2, 3]);
   line(run.poses.slice(0, frame + 1), run.colours.reference, 2.5);
@@ -162,7 +163,7 @@ function drawRobot(pen, run, frame, place, scale) {
   pen.arc(0, 0, run.radius, 0, 2 * Math.PI);
   pen.fillStyle = "rgba(255,255,255,0.85)";
   pen.fill();
-  pen.strokeStyle = pen.fillStyle = run.colours.robot;
+  pen.strokeStyle = pen.fillStyle = "#1f2933";
   pen.lineWidth = 1.6 / scale;
   pen.stroke();
   for (const { radius, at, rolling, steered } of run.wheels) {

@@ -41,7 +41,7 @@ from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.fit.intervals import Interval
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Callout, Fact, Figure, Table
-from omnibench.report.figures import motion_system, parameters
+from omnibench.report.figures import motion_system
 from omnibench.report.numbers import fixed
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Array, Robot, relative_deviations, wheel_equations
@@ -300,7 +300,8 @@ def test_recordings_with_scans_or_targets_have_their_pictures(told: Render) -> N
     made = sample().dataset
     report = told({"room": made})
     assert "data" in report.sections
-    assert report.row("What was recorded", "LIDAR scans")[1].endswith(" scans")
+    contents = next(rows for caption, rows in report.tables.items() if ", robot " in caption)
+    assert next(row for row in contents if row[0] == "LIDAR scans")[1].endswith(" scans")
     plain = replace(made, scans=None, trajectories=tuple(replace(t, targets=None) for t in made.trajectories))
     assert "recording" not in told({"room": plain}).sections
 
@@ -417,7 +418,7 @@ def labels(figure: Figure) -> list[str]:
 
 
 def test_every_wheel_stands_at_its_distance_and_angle_and_is_as_long_as_its_diameter() -> None:
-    figure = parameters(APR_02)
+    (figure,) = motion_system(APR_02).figures
     for wheel, corners in zip(APR_02.wheels, rectangles(figure.plot.data[0]), strict=True):
         place = wheel.distance * np.array([math.cos(wheel.angle), math.sin(wheel.angle)])
         np.testing.assert_allclose(corners.mean(axis=0), place, atol=1e-4)
@@ -427,19 +428,19 @@ def test_every_wheel_stands_at_its_distance_and_angle_and_is_as_long_as_its_diam
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_wheels_given_by_x_and_y_stand_there_along_their_rolling(robot: Robot) -> None:
-    figure, _ = motion_system(robot)
+    (figure,) = motion_system(robot).figures
     for wheel, corners in zip(robot.wheels, rectangles(figure.plot.data[0]), strict=True):
         np.testing.assert_allclose(corners.mean(axis=0), wheel.position, atol=1e-4)
         np.testing.assert_allclose(corners[1] - corners[2], [2 * wheel.radius, 0], atol=1e-4)
     x, y = (f"{value:g}".replace("-", "−") for value in robot.wheels[0].position)
     first = robot.wheels[0]
-    assert f"<b>{first.name}</b> r {first.radius:g} m<br>x {x} m<br>y {y} m" in labels(parameters(robot))
+    assert f"<b>{first.name}</b> r {first.radius:g} m<br>x {x} m<br>y {y} m" in labels(figure)
     arrows = [name for name in labels(figure) if name.startswith("V<sub>")]
     assert arrows == [f"V<sub>{name}</sub>" for name in robot.wheel_names]
 
 
 def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:
-    figure, _ = motion_system(APR_02)
+    (figure,) = motion_system(APR_02).figures
     (shafts,) = (trace for trace in figure.plot.data if trace.legendgroup == "rolling" and trace.mode == "lines")
     ends = np.array([[np.nan if v is None else v for v in values] for values in (shafts.y, shafts.x)]).T
     ends[:, 1] *= -1
@@ -450,7 +451,7 @@ def test_the_arrow_at_a_wheel_points_where_a_positive_rate_drives_it() -> None:
 
 def test_the_best_entrys_geometry_is_drawn_over_the_design() -> None:
     view = usual_view()
-    _, figure = robot_picture(view).figures
+    (figure,) = robot_picture(view).figures
     (fitted,) = (trace for trace in figure.plot.data if trace.legendgroup == "fitted")
     reading = read_matrix(view.dataset.robot, view.best.typical.matrix)
     radii, distances, angles = np.array([each.value for each in reading.parameters]).reshape(3, 3)

@@ -29,7 +29,12 @@ from sample_robots import LEVER_MECANUM
 from syrupy.assertion import SnapshotAssertion
 
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.report.discovery_report import discovery_report, sure_blocks, what_blocks
+from omnibench.discover.report.discovery_report import (
+    discovery_report,
+    evidence_blocks,
+    experiment_blocks,
+    parameter_blocks,
+)
 from omnibench.discover.result import Absorbed, Discovery, EstimatedParameter, NotLookedFor, discovery_document
 from omnibench.report.blocks import Document, Section
 from omnibench.report.render import render
@@ -87,11 +92,19 @@ def test_four_wheels_and_one_run_of_each_command_have_a_report() -> None:
     assert not any(is_empty(trace) for each in drawn for trace in each["data"])
 
 
-def test_turns_on_the_spot_are_told_beside_the_figures_of_directions() -> None:
-    dataset = named().dataset
-    runs = [replace(run, v=0.0) if run.alpha == 0 else run for run in dataset.trajectories]
-    told = whole(lambda: replace(named(), dataset=replace(dataset, trajectories=tuple(runs))))
-    assert re.search(r"Turns on the spot, mean heading residual: .*° → .*° \(noise ±", told.text)
+def test_the_commands_are_in_the_order_of_their_motions_and_few_are_named_below() -> None:
+    few = named().dataset
+    kept = {run.command for run in few.split("train") if run.alpha == 0 or run.omega == 0}
+    runs = [run for run in few.split("train") if run.command in kept]
+    names = {run.id for run in runs}
+    found = named()
+    chosen = [index for index, name in enumerate(found.trajectories) if name in names]
+    less = {
+        field: tuple(getattr(found, field)[index] for index in chosen)
+        for field in ("trajectories", "before", "after", "whitened_before", "whitened_after")
+    }
+    told = whole(lambda: replace(found, **less)).text
+    assert "1 0.2 m/s at 0°, −0.35 rad/s; 2 0.2 m/s at 0°, straight; 3 0.2 m/s at 60°, straight" in told
 
 
 def test_parameters_have_intervals_and_units(report: Page) -> None:
@@ -107,7 +120,7 @@ def test_parameters_have_intervals_and_units(report: Page) -> None:
 
 def test_a_shape_was_chosen_and_has_no_interval() -> None:
     effect = replace(named().effects[0], parameters=(EstimatedParameter("rollers", 10.0, "1", 10.0, 10.0, shape=True),))
-    blocks = tuple(what_blocks(replace(named(), effects=(effect,))))
+    blocks = tuple(parameter_blocks(replace(named(), effects=(effect,))))
     rows = part(Section("what", "", blocks)).tables["Parameters of the effects that were added"]
     assert rows[2][:3] == ["rollers", "10", "chosen among a few"]
 
@@ -115,14 +128,23 @@ def test_a_shape_was_chosen_and_has_no_interval() -> None:
 def test_a_class_names_its_members_and_the_experiment_that_separates_them() -> None:
     effect = replace(named().effects[0], weight=0.52, confusable_with=("load_transfer",), in_doubt="few turns")
     found = replace(named(), verdict="class", effects=(effect,), experiments=(EXPERIMENT,))
-    told = part(Section("both", "", (*what_blocks(found), *sure_blocks(found))))
-    assert "These data cannot tell it from load_transfer" in told.text
+    blocks = (*parameter_blocks(found), *experiment_blocks(found), *evidence_blocks(found))
+    told = part(Section("all", "", blocks))
+    assert "weight 52.0 %, cannot be told from load_transfer" in told.text
     assert "In doubt: few turns" in told.text
     assert EXPERIMENT.description in told.text
     rows = told.tables["What to drive to tell acceleration_slip from its look-alikes"]
     assert rows[1:] == [["turning left on the spot at 1 rad/s", "12.5", "4"]]
     assert EXPERIMENT.config in told.text
-    assert "52.0 %" in told.text
+
+
+def test_the_first_screen_says_how_sure_the_cause_is() -> None:
+    effect = replace(named().effects[0], weight=0.52, confusable_with=("load_transfer",))
+    alike = whole(lambda: replace(named(), verdict="class", effects=(effect,))).text
+    assert "(rotation translation coupling; it may as well be load transfer)" in alike
+    assert "found; which of a class is open; weight of the name 52.0 %" in alike
+    assert "likeliest, but no name is sure" in whole(lambda: replace(named(), verdict="unknown")).text
+    assert "an unnamed term closes" in whole(lambda: replace(named(), verdict="unknown", effects=())).text
 
 
 def test_errors_before_and_after_stand_beside_the_floor(report: Page) -> None:

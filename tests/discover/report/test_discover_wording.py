@@ -1,21 +1,20 @@
 """A discovery's figures as people read them, and the scale on which its panels are drawn."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from discovery_samples import held_out, named
 
-from omnibench.discover.report.residuals import PLAIN, Curve, Panel, grid
+from omnibench.discover.report.figures import PLAIN, Curve, Panel, error_grid, grid
 from omnibench.discover.report.tables import (
-    answer_in_words,
+    answer,
     chance,
-    closed_in_words,
+    closed_share,
     extrapolation_table,
-    extrapolations_in_words,
-    floor_in_words,
-    gap_in_words,
-    held_out_in_words,
+    gap_values,
+    held_out_runs,
     reading,
     value_and_interval,
     weight_in_words,
@@ -24,19 +23,18 @@ from omnibench.discover.result import EstimatedParameter, Extrapolation, Gap
 
 
 @pytest.mark.parametrize(
-    ("value", "unit", "words"),
+    ("unit", "factor", "shown"),
     [
-        (0.0312, "s", "31.2 ms"),
-        (0.05, "m", "50.0 mm"),
-        (0.005, "rad/s", "0.286°/s"),
-        (0.01, "1", "1.00 %"),
-        (0.02, "s/rad", "0.0200 s/rad"),
-        (0.3, "s2/m", "0.300 s²/m"),
-        (2e-5, "1/s", "7.20 %/h"),
+        ("s", 1e3, "ms"),
+        ("m", 1e3, "mm"),
+        ("1", 100, "%"),
+        ("s/rad", 1, "s/rad"),
+        ("s2/m", 1, "s²/m"),
+        ("1/s", 3.6e5, "%/h"),
     ],
 )
-def test_quantities_are_read_in_the_units_of_people(value: float, unit: str, words: str) -> None:
-    assert reading(unit).words(value) == words
+def test_quantities_are_read_in_the_units_of_people(unit: str, factor: float, shown: str) -> None:
+    assert reading(unit) == (factor, shown)
 
 
 def test_a_parameter_shares_its_decimals_with_its_interval() -> None:
@@ -64,41 +62,47 @@ def test_a_chance_below_any_meaning_is_cut() -> None:
 
 
 def test_no_gap_is_not_a_gap_that_stayed_open() -> None:
-    assert closed_in_words(Gap("eq6", 1.0, 1.0, 1.0, None, 0.1)) == "no gap to close"
-    assert closed_in_words(Gap("eq6", 1.0, 0.4, None, None, 0.1)) == "no share known"
-    assert gap_in_words(Gap("eq6", 0.0412, 0.0213, 0.0205, 0.961, 0.001)) == "0.0412 → 0.0213 (floor 0.0205), 96.1 %"
+    assert closed_share(Gap("eq6", 1.0, 1.0, 1.0, None, 0.1)) == "no gap to close"
+    assert closed_share(Gap("eq6", 1.0, 0.4, None, None, 0.1)) == "no share known"
+    assert gap_values(Gap("eq6", 0.0412, 0.0213, 0.0205, 0.961, 0.001)) == ("0.0412", "0.0213", "0.0205")
 
 
-def test_a_bound_many_times_the_plain_matrix_s_is_not_given_as_a_figure() -> None:
-    said, not_said = (Extrapolation("square", "turns", 0.158, after) for after in (0.3, 8.14))
-    assert extrapolations_in_words((said,)) == (
-        "square: turns. Final position within 158 mm by the plain matrix, within 300 mm by the extended model (95 %).",
-    )
-    assert "cannot be said" in extrapolations_in_words((not_said,))[0]
-    assert "8.14" not in extrapolations_in_words((not_said,))[0]
-    assert extrapolation_table((not_said,)).rows[0].cells[-1].text == "cannot be said"
+@pytest.mark.parametrize(("after", "shown"), [(0.3, "300"), (8.14, "cannot be said"), (math.nan, "cannot be said")])
+def test_a_bound_many_times_the_plain_matrix_s_is_not_given_as_a_figure(after: float, shown: str) -> None:
+    (row,) = extrapolation_table((Extrapolation("square", "turns", 0.158, after),)).rows
+    assert [cell.text for cell in row.cells] == ["square", "turns", "158", shown]
 
 
 def test_runs_of_which_none_is_repeated_are_not_called_repetitions() -> None:
     found = named()
     repetitions = held_out(found, "repetitions")
-    assert held_out_in_words(found, repetitions) == "held-out repetitions"
+    assert held_out_runs(found, repetitions) == "held-out repetitions: 36 runs"
     alone = replace(found, noise=replace(found.noise, source="within runs"))
-    assert held_out_in_words(alone, repetitions) == "held-out runs"
-    assert "No command is repeated" in floor_in_words(alone)
+    assert held_out_runs(alone, repetitions) == "held-out runs: 36 runs"
 
 
 def test_a_cause_that_is_not_sure_is_said_to_be_the_likeliest() -> None:
     found = named()
     (effect,) = found.effects
     doubtful = replace(found, effects=(replace(effect, class_weight=0.5),))
-    assert not answer_in_words(found).startswith("Likeliest")
-    assert answer_in_words(doubtful) == f"Likeliest, but not sure: {answer_in_words(found)}"
+    assert not answer(found).startswith("Likeliest")
+    assert answer(doubtful) == f"Likeliest, but not sure: {answer(found)}"
+
+
+def test_the_errors_after_each_effect_stand_between_the_plain_matrix_and_the_extended_model() -> None:
+    found = named()
+    first, last = found.steps
+    between = replace(last, name="+ wheel_dead_zone", eq6_held_out=0.02, held_out=9.0)
+    found = replace(found, steps=(first, between, last))
+    bars = [[trace.y[0] for trace in figure.plot.data] for figure in error_grid(found).figures]
+    assert bars[0] == ["plain matrix", "+ wheel_dead_zone", "extended model", "floor"]
+    unknown = replace(found, steps=(first, replace(between, eq6_held_out=None, held_out=None), last))
+    assert [trace.y[0] for trace in error_grid(unknown).figures[0].plot.data] == [bars[0][0], *bars[0][2:]]
 
 
 def scale_of(values: list[float], half_width: list[float]) -> float:
     curve = Curve(PLAIN, np.array(values), np.array(half_width))
-    panel = Panel("a panel", np.arange(float(len(values))), (curve,), "x", "y", "mm")
+    panel = Panel("a panel", np.arange(float(len(values))), "x", "mm", (curve,))
     low, high = grid([panel], (PLAIN,)).figures[0].plot.layout.yaxis.range
     assert low == -high
     return float(high)

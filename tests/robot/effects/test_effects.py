@@ -562,14 +562,6 @@ def test_a_stream_that_is_put_elsewhere_has_its_poses_from_there_on() -> None:
     np.testing.assert_allclose(streamed(stream, log), chosen.poses([log])[0], rtol=0, atol=1e-12)
 
 
-def test_a_motion_that_takes_no_time_moves_the_uncorrected_path_as_well() -> None:
-    chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
-    stream, quarter = chosen.stream(), np.linalg.solve(chosen.matrix, [0.0, 0.0, math.pi / 2])
-    stream.drive(quarter, 0.0)
-    stream.drive(np.linalg.solve(chosen.matrix, [0.05, 0.0, 0.0]), 0.1)
-    np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
-
-
 def usual(name: str) -> dict[str, float]:
     return {
         each.name: each.choices[0] if each.choices else 0.0
@@ -577,12 +569,14 @@ def usual(name: str) -> dict[str, float]:
     }
 
 
-def test_the_heading_is_the_references_in_a_stream_whose_frame_is_turned() -> None:
+def test_the_heading_turns_with_the_frame_of_a_stream_and_with_a_motion_that_takes_no_time() -> None:
     chosen = model(make_term("smooth_heading", usual("smooth_heading") | {"along_sin1": 0.1}, APR_02))
-    stream = chosen.stream()
-    stream.frame_heading = math.pi / 2
-    stream.drive(np.linalg.solve(chosen.matrix, [0.05, 0.0, 0.0]), 0.1)
-    np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
+    framed, moved = chosen.stream(), chosen.stream()
+    framed.frame_heading = math.pi / 2
+    moved.drive(np.linalg.solve(chosen.matrix, [0.0, 0.0, math.pi / 2]), 0.0)
+    for stream in (framed, moved):
+        stream.drive(np.linalg.solve(chosen.matrix, [0.05, 0.0, 0.0]), 0.1)
+        np.testing.assert_allclose(stream.moved, [0.055, 0.0, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
