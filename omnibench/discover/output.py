@@ -5,18 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-import polars as pl
 from pydantic import Field
 
 from omnibench import files
 from omnibench.config import Model, to_json, to_yaml
 from omnibench.discover.report.discovery_report import discovery_report
-from omnibench.discover.report.discovery_result import DiscoveryResult
+from omnibench.discover.report.discovery_result import DiscoveryResult, residual_table
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
 from omnibench.report.render import render
 from omnibench.report.result import with_next_step
-from omnibench.robot.kinematics import Array
 
 # First line of config.yaml: it tells a folder of results from one that happens to hold a file of that name.
 _MARK = "# The effective options of a discovery; the results beside it were made with them."
@@ -88,28 +85,3 @@ def _experiments(discovery: Discovery) -> dict[str, str]:
 def _config(options: DiscoverOptions) -> str:
     """The content of config.yaml."""
     return f"{_MARK}\n{to_yaml(options)}"
-
-
-def residual_table(discovery: Discovery) -> pl.DataFrame:
-    """Table of the reference poses of the training runs after their starts, with residuals before and after.
-
-    Residuals are reference minus odometry, by the plain matrix (before) and by the extended model (after), in m and
-    rad; whitened ones are independent and of unit variance under the noise.
-    """
-    trajectories = {trajectory.id: trajectory for trajectory in discovery.dataset.trajectories}
-    runs = [trajectories[name] for name in discovery.trajectories]
-    columns: dict[str, list[object] | Array] = {
-        "trajectory": [run.id for run in runs for _ in run.pose_times[1:]],
-        "command": [run.command for run in runs for _ in run.pose_times[1:]],
-        "t": np.concatenate([run.pose_times[1:] for run in runs]),
-    }
-    poses = np.concatenate([run.poses[1:] for run in runs])
-    columns |= dict(zip(("x", "y", "theta"), poses.T, strict=True))
-    for label, values, names in (
-        ("before", discovery.before, ("x_m", "y_m", "heading_rad")),
-        ("after", discovery.after, ("x_m", "y_m", "heading_rad")),
-        ("whitened_before", discovery.whitened_before, ("x", "y", "heading")),
-        ("whitened_after", discovery.whitened_after, ("x", "y", "heading")),
-    ):
-        columns |= dict(zip((f"{label}_{name}" for name in names), np.concatenate(values).T, strict=True))
-    return pl.DataFrame(columns, schema_overrides={"command": pl.String})

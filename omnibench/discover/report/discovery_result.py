@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 
-from omnibench.discover.output import residual_table
 from omnibench.discover.report import tables
 from omnibench.discover.report.figures import error_grid
 from omnibench.discover.result import CALIBRATION_FILES, Discovery, discovery_document, experiment_file
 from omnibench.report.blocks import Cell, FigureGrid, Table, Tone
 from omnibench.report.result import NextStep, Remark, Result
+from omnibench.robot.kinematics import Array
 from omnibench.words import kind_of_data, plural
 
 # So much is shown that the answer fits into a screen; the report has the rest.
@@ -140,3 +141,28 @@ def _in_brief(table: Table) -> Table:
         for row in table.rows
     )
     return Table(table.caption, tuple(table.columns[index] for index in shown), tuple(rows))
+
+
+def residual_table(discovery: Discovery) -> pl.DataFrame:
+    """Table of the reference poses of the training runs after their starts, with residuals before and after.
+
+    Residuals are reference minus odometry, by the plain matrix (before) and by the extended model (after), in m and
+    rad; whitened ones are independent and of unit variance under the noise.
+    """
+    trajectories = {trajectory.id: trajectory for trajectory in discovery.dataset.trajectories}
+    runs = [trajectories[name] for name in discovery.trajectories]
+    columns: dict[str, list[object] | Array] = {
+        "trajectory": [run.id for run in runs for _ in run.pose_times[1:]],
+        "command": [run.command for run in runs for _ in run.pose_times[1:]],
+        "t": np.concatenate([run.pose_times[1:] for run in runs]),
+    }
+    poses = np.concatenate([run.poses[1:] for run in runs])
+    columns |= dict(zip(("x", "y", "theta"), poses.T, strict=True))
+    for label, values, names in (
+        ("before", discovery.before, ("x_m", "y_m", "heading_rad")),
+        ("after", discovery.after, ("x_m", "y_m", "heading_rad")),
+        ("whitened_before", discovery.whitened_before, ("x", "y", "heading")),
+        ("whitened_after", discovery.whitened_after, ("x", "y", "heading")),
+    ):
+        columns |= dict(zip((f"{label}_{name}" for name in names), np.concatenate(values).T, strict=True))
+    return pl.DataFrame(columns, schema_overrides={"command": pl.String})
