@@ -98,6 +98,13 @@ def test_what_was_not_recorded_is_told_so(made: Sample, tmp_path: Path) -> None:
     assert all(run["scans"] == [] and run["targets"] is None for run in played(told).values())
 
 
+def test_commands_are_counted_as_the_robot_was_sent_them(made: Sample, tmp_path: Path) -> None:
+    sent = np.array([[0.0, 0.1, 0, 0, 1], [0.5, 0.2, 0, 0, 1]])
+    runs = tuple(replace(run, sent=sent) for run in made.dataset.trajectories)
+    row = page(replace(made.dataset, trajectories=runs), tmp_path).row(CONTENTS, "Sent commands")
+    assert row[1:3] == [f"{2 * len(runs)} commands", "500 ms"]
+
+
 def test_warnings_are_told(made: Sample, tmp_path: Path) -> None:
     told = page(replace(made.dataset, warnings=("something odd",), simulated=False), tmp_path).text
     assert "something odd" in told

@@ -221,7 +221,7 @@ def contents_table(dataset: Dataset) -> blocks.Table:
     def having(field: str) -> list[Trajectory]:
         return [run for run in runs if getattr(run, field) is not None]
 
-    commanded, sent = having("omega"), [run for run in having("sent") if len(run.sent or ())]
+    commanded, sent = having("omega"), [run for run in having("sent") if run.sent is not None and len(run.sent)]
     different = f"{count(len({(run.v, run.alpha, run.omega) for run in commanded}))} different"
     add("Motion command", "v, α, ω, d", commanded, [np.zeros(len(commanded))], "runs", different)
     orders = [np.asarray(run.sent)[:, 0] for run in sent]
