@@ -69,7 +69,6 @@ def compare(
     from platformdirs import user_cache_path
 
     from omnibench.compare.report.comparison_view import ComparisonView
-    from omnibench.compare.report.document import comparison_document
     from omnibench.compare.report.searches import write_traces
     from omnibench.compare.report.view import views
 
@@ -85,13 +84,14 @@ def compare(
     with ProgressDisplay() as watch:
         kept = user_cache_path("omnibench") / "fits" if added else None
         result = omnibench.run_comparison(chosen, output, watch, force=force, cache=kept)
+        view = ComparisonView(result, everything=everything)
         if traces is not None:
-            files = [file for view in views(result) for file in write_traces(view, traces / view.name)]
+            files = [file for each in views(result) for file in write_traces(each, traces / each.name)]
             typer.echo(f"traces: {traces} ({len(files)} searches)", err=True)
         if figures is not None:
             watch(Progress("drawing the figures"))
-            shared.write_asked_figures(comparison_document(result), figures)
-    show(ComparisonView(result, everything=everything), as_json)
+            shared.write_asked_figures(view.document(), figures)
+    show(view, as_json)
     if result.nothing_answered or result.broken:
         raise typer.Exit(1)
 

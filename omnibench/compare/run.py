@@ -16,7 +16,7 @@ from pathlib import Path
 from omnibench.compare.config import CompareConfig, effective_config, load_calibrators
 from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, ComparedRobot, FitTask, PlannedFit, load_robots, plan_fits
-from omnibench.compare.report.document import comparison_document
+from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.result import ComparisonResult, ScoredFit
 from omnibench.compare.score import certify, score_fits, typical_answers
 from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts, is_mean, make_cells
@@ -222,7 +222,7 @@ def run_comparison(
         with resumable(fits, store, folder):
             result = assess(config, robots, fits, results, folder, broken, broken_plugins, progress)
             write_results(result)
-            write_document(comparison_document(result), folder / "report.html")
+            write_document(ComparisonView(result).page(), folder / "report.html")
         return result
 
 

@@ -41,7 +41,7 @@ class ComparisonView(Result):
         return "; ".join(answer_sentence(view) for view in views(self.result))
 
     def next_step(self) -> NextStep:
-        result, report = self.result, f"read {self.result.output / 'report.html'}"
+        result = self.result
         if result.nothing_answered:
             first = result.failures[0] if result.failures else "no method is for these robots"
             what = "no method gave an answer" if result.config.robots else "every search failed"
@@ -50,17 +50,21 @@ class ComparisonView(Result):
             ending = f"{plural(len(result.broken), 'robot')} left out, whose recordings cannot be read"
             return NextStep(ending, "say where they are with --data, or take them out of the config, and run again")
         if result.config.robots:
-            return NextStep(robots_sentence(result).rstrip("."), report)
+            return NextStep(robots_sentence(result).rstrip("."), self._reading)
         compared = f"{plural(len({run.fit.label for run in result.runs}), 'entry')} compared"
         name, best = next(iter(result.held_out.items()), ("", None))
         file = None if best is None else calibration_file(result, name, best.label)
         if best is None or file is None:
-            return NextStep(f"{compared} in {result.output}", "read report.html in that folder")
+            return NextStep(f"{compared} in {result.output}", self._reading)
         if best.verdict.verdict == "better":
             outcome = f"{compared}; the best on {name}, {best.label}, beats the design on runs held out"
             return NextStep(outcome, *how_to_use(read_calibration(file), file))
         unsure = f"{compared}; that the best on {name}, {best.label}, beats the design was not shown by runs held out"
-        return NextStep(unsure, f"{report} and record more runs for validation")
+        return NextStep(unsure, "record more runs for validation, and compare again")
+
+    @property
+    def _reading(self) -> str:
+        return f"read {self.result.output / 'report.html'}"
 
     def tables(self) -> Sequence[Table]:
         result, shown = self.result, list[Table]()
@@ -96,6 +100,9 @@ class ComparisonView(Result):
 
     def document(self) -> Document:
         return comparison_document(self.result)
+
+    def page(self) -> Document:
+        return self.document() if self.next_step().then == self._reading else super().page()
 
     def json(self) -> Mapping[str, Any]:
         return summary(self.result)
