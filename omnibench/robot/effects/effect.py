@@ -434,10 +434,15 @@ def make_term(
         is_form = isinstance(effect, MotionEffect) and accepts_form(effect, robot, key)
         if key not in listed and not effect.accepts(key) and not is_form:
             raise UnknownNameError("parameter", key, listed, prefix)
-        if not _is_number(value) or not math.isfinite(value):
+        if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
             raise DataError(f"{prefix}: parameter {key!r} is {value!r}, not a finite number")
+        # Its range, or that of the parameter whose form it is of, or of a covariate's scale; else of an unknown session
         formed = key.partition(":")[0]
-        low, high = _SCALES if ":" in key and formed not in listed else _limits(listed.get(formed))
+        low, high = _SCALES if ":" in key else (-_FAR_OUTSIDE, _FAR_OUTSIDE)
+        if (parameter := listed.get(formed)) is not None:
+            low, high = parameter.low, parameter.high
+            if not parameter.choices:
+                low, high = -_FAR_OUTSIDE * parameter.largest, _FAR_OUTSIDE * parameter.largest
         if not low <= value <= high:
             raise DataError(f"{prefix}: parameter {key!r} is {value:g}, not within {low:g} and {high:g}")
     for parameter in listed.values():
@@ -458,17 +463,3 @@ def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:
     """DataError, in one line that begins with ``prefix``: the effect does not apply to the robot."""
     if not effect.applies(robot):
         raise DataError(f"{prefix} is for {effect.only_for}; robot {robot.name} is none, leave the effect out")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _limits(parameter: Parameter | None) -> tuple[float, float]:
-    """Lowest and highest allowed value; None: a parameter that is accepted but not listed."""
-    if parameter is None:
-        return -_FAR_OUTSIDE, _FAR_OUTSIDE
-    if parameter.choices:
-        return parameter.low, parameter.high
-    largest = _FAR_OUTSIDE * parameter.largest
-    return -largest, largest

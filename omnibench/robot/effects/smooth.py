@@ -17,8 +17,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Need, Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.textbook import EachWheelEffect, has_rollers, of_wheels
+from omnibench.robot.effects.effect import Need, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.textbook import BodyEffect, EachWheelEffect, WheelEffect, has_rollers, of_wheels
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals, needed
 
@@ -147,10 +147,9 @@ ACROSS_A_LINE = PLACE._replace(words="the line")
 MOTION = Covariate("command", "the motion")
 
 
-class SmoothEffect(WithoutCause, MotionEffect):
+class SmoothEffect(WithoutCause, BodyEffect):
     """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
 
-    stage = "body"
     modes: ClassVar[tuple[str, ...]]
     labels: ClassVar[tuple[str, ...]]
 
@@ -449,10 +448,9 @@ class SmoothWheelRate(WithoutCause, EachWheelEffect):
 
 
 @effects.register("smooth_common_rate")
-class SmoothCommonRate(WithoutCause, MotionEffect):
+class SmoothCommonRate(WithoutCause, WheelEffect):
     """Unknown effect: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
 
-    stage = "wheel"
     shows_in = "wheel rate"
     fixed_parameters = (
         *(
@@ -468,10 +466,9 @@ class SmoothCommonRate(WithoutCause, MotionEffect):
 
 
 @effects.register("smooth_acceleration")
-class SmoothAcceleration(WithoutCause, MotionEffect):
+class SmoothAcceleration(WithoutCause, BodyEffect):
     """Unknown effect: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
 
-    stage = "body"
     shows_in = "acceleration"
     fixed_parameters = (
         Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from omnibench.robot.paths import legs_of, usual_paths, wheel_log
 _STEPS = {"arc": "arcs", "euler": "Euler steps"}
 _WRONG_WAY = "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check "
 _NO_TURN = "ros2_controllers: the matrix does not turn this robot counter-clockwise; check wheel signs"
+_PLACE = "x {:.4f} m, y {:.4f} m of the robot's centre"
 _TAKES_END = "the controller takes the steering angle at a sample's end, the calibration in its middle"
 
 # All chosen.
@@ -39,28 +41,19 @@ _CORNERS = {
 }
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of a ROS 2 node: its name, with dots where it is nested, its value, and what stands behind it."""
-
-    name: str
-    value: float | str | tuple[str, ...]
-    comment: str = ""
-
-
 @dataclass(frozen=True, eq=False)
 class Controller:
     """A controller whose parameters come closest to a matrix.
 
-    matrix (3, M): the inverse kinematic matrix by which it computes the twist of its base frame. base: that frame in
-    the robot's. holds: what stands for the matrix, in words, and lost: what that costs. joints: parameters that name
-    joints, in words. notes: what else to do or to know. integration: how it integrates a twist. covariances: their
-    parameters' names. topic: of its odometry. lever: True if what is left where the robot turns on the
-    spot is the lever arm of a frame that is not at its base.
+    values: of the parameters, by their names, numbers and names of joints. matrix (3, M): the inverse kinematic matrix
+    by which it computes the twist of its base frame. base: that frame in the robot's. holds: what stands for the
+    matrix, in words, and lost: what that costs. joints: parameters that name joints, in words. notes: what else to do
+    or to know. integration: how it integrates a twist. topic: of its odometry. lever: True if what is left where the
+    robot turns on the spot is the lever arm of a frame that is not at its base.
     """
 
     name: str
-    parameters: tuple[Parameter, ...]
+    values: Mapping[str, float | str | Sequence[str]]
     matrix: Array
     holds: str
     joints: str
@@ -68,7 +61,6 @@ class Controller:
     notes: tuple[str, ...] = ()
     base: Mount = field(default_factory=Mount)
     integration: str = "arcs"
-    covariances: str = "{}_covariance_diagonal"
     topic: str = "odom"
     lever: bool = True
 
@@ -119,86 +111,37 @@ def warnings_of(calibration: Calibration, fitted: Controller, design: Controller
     if integrated != fitted.integration:
         warnings.append(f"the matrix was calibrated for {integrated}, the controller integrates {fitted.integration}")
     if calibration.effects:
-        warnings.append(_effects_left_out(calibration))
+        # By how much a live node's odometry, which has the effects, differs
+        whole = calibration.model
+        plain = replace(whole, matrix=calibration.matrix_without_effects, terms=(), fade=None)
+        differences, words = [], {"straight 1.0": "a metre ahead", "turn 360": "a turn"}
+        for path in usual_paths(robot)[:-1]:  # the square has no motion that is new
+            log = wheel_log(calibration, legs_of(path, robot))
+            x, y, heading = (whole.poses([log])[0][-1] - plain.poses([log])[0][-1]).tolist()
+            way, turn = 1e3 * math.hypot(x, y), math.degrees(abs(heading))
+            differences.append(f"{way:.1f} mm and {turn:.2f} deg {words.get(path, path)}")
+        fitted_with = "without" if calibration.plain is not None else "with"
+        warnings.append(
+            f"effects are left out, the matrix was fitted {fitted_with} them: {calibration.effects_in_words}; a live "
+            f"node, which has them, differs by {', '.join(differences)}"
+        )
     # Frames that are not the robot's centre, and a base frame that would leave less.
     if robot.mount is not None:
         warnings.append("the calibration is of the tracked point, the parameters are of the robot's centre (mount)")
     if max(abs(base.x), abs(base.y)) > _NEGLIGIBLE:
         warnings.append(
-            f"base_frame_id has to be a frame at {_place(base.x, base.y)}, in the middle of the wheels that do not "
-            "steer"
+            f"base_frame_id has to be a frame at {_PLACE.format(base.x, base.y)}, in the middle of the wheels that do "
+            "not steer"
         )
     to_right, ahead, _ = remaining_errors(robot, fitted.matrix, true, base)[:, -1].tolist()
     if fitted.lever and max(abs(ahead), abs(to_right)) > _NEGLIGIBLE:
-        place = _place(base.x + ahead, base.y - to_right)
+        place = _PLACE.format(base.x + ahead, base.y - to_right)
         warnings.append(f"the millimetres a full turn are a lever arm: a base_frame_id at {place} would leave none")
     if robot.skid:
         warnings.append("the robot skids: the parameters are those of the floor, the load and the speeds driven")
     if calibration.noise is None:
         warnings.append("covariances are left at the controller's defaults: the calibration has no noise model")
     return tuple(warnings)
-
-
-def _effects_left_out(calibration: Calibration) -> str:
-    """The effects that the controller does not hold, and by how much a live node's odometry differs for them."""
-    robot, whole = calibration.robot, calibration.model
-    matrix = replace(whole, matrix=calibration.matrix_without_effects, terms=(), fade=None)
-    parts, words = [], {"straight 1.0": "a metre ahead", "turn 360": "a turn"}
-    for path in usual_paths(robot)[:-1]:  # the square has no motion that is new
-        log = wheel_log(calibration, legs_of(path, robot))
-        x, y, heading = (whole.poses([log])[0][-1] - matrix.poses([log])[0][-1]).tolist()
-        parts.append(
-            f"{1e3 * math.hypot(x, y):.1f} mm and {math.degrees(abs(heading)):.2f} deg {words.get(path, path)}"
-        )
-    fitted = "out" if calibration.plain is not None else ""
-    return (
-        f"effects are left out, the matrix was fitted with{fitted} them: {calibration.effects_in_words}; a live node, "
-        f"which has them, differs by {', '.join(parts)}"
-    )
-
-
-def _place(x: float, y: float) -> str:
-    return f"x {x:.4f} m, y {y:.4f} m of the robot's centre"
-
-
-def covariance_parameters(calibration: Calibration, controller: Controller) -> tuple[Parameter, ...]:
-    """The controller's covariances by the calibration's noise; empty without a noise model."""
-    pose = pose_variances(calibration, controller.base)
-    if pose is None:
-        return ()
-    per_message = f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}"
-    parameters = []
-    for quantity, variances, comment in (
-        ("pose", pose, "m2, rad2: what 1 s adds"),
-        ("twist", pose / calibration.sample_period, per_message),
-    ):
-        x, y, heading = (f"{value:.6e}" for value in variances.tolist())
-        diagonal = (x, y, "0.0", "0.0", "0.0", heading)
-        parameters.append(Parameter(controller.covariances.format(quantity), diagonal, comment))
-    return tuple(parameters)
-
-
-def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
-    """Parameters of a node as YAML."""
-    lines, opened = [f"{name}:", "  ros__parameters:"], list[str]()
-    for parameter in parameters:
-        *path, key = parameter.name.split(".")
-        shared = next((at for at, (a, b) in enumerate(zip(path, opened, strict=False)) if a != b), len(opened))
-        lines.extend(f"{'  ' * (depth + 2)}{path[depth]}:" for depth in range(min(shared, len(path)), len(path)))
-        opened = path
-        value = parameter.value
-        if isinstance(value, float):
-            value = number(value, 12)
-        elif isinstance(value, tuple):
-            value = f"[{', '.join(value)}]"
-        comment = f"  # {parameter.comment}" if parameter.comment else ""
-        lines.append(f"{'  ' * (len(path) + 2)}{key}: {value}{comment}")
-    return "\n".join(lines) + "\n"
-
-
-def number(value: float, decimals: int) -> str:
-    """A number with so many decimals."""
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0
 
 
 def interval_in_words(calibration: Calibration) -> str:
@@ -352,16 +295,15 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
     unread = [name for name in robot.wheel_names if name not in left + right]
     return Controller(
         "diff_drive_controller",
-        (
-            Parameter("left_wheel_names", tuple(map(joint_name, left))),
-            Parameter("right_wheel_names", tuple(map(joint_name, right))),
-            Parameter("wheel_separation", apart, "m, as designed"),
-            Parameter("wheel_radius", radius, "m, as designed"),
-            Parameter("wheel_separation_multiplier", separation / apart),
-            Parameter("left_wheel_radius_multiplier", float(radii[0] / radius)),
-            Parameter("right_wheel_radius_multiplier", float(radii[1] / radius)),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "left_wheel_names": [joint_name(name) for name in left],
+            "right_wheel_names": [joint_name(name) for name in right],
+            "wheel_separation": apart,
+            "wheel_radius": radius,
+            "wheel_separation_multiplier": separation / apart,
+            "left_wheel_radius_multiplier": float(radii[0] / radius),
+            "right_wheel_radius_multiplier": float(radii[1] / radius),
+        },
         by_side @ reading,
         "two wheel radii and one separation",
         "left_wheel_names and right_wheel_names",
@@ -431,21 +373,16 @@ def car(robot: Robot, drive: CarDrive, matrix: Array) -> Controller:
         raise ConfigError(f"{_WRONG_WAY}the signs of the wheels and of the steering angles")
     wheelbase = radius / turn
     share = wheelbase / abs(ahead)
-    widths = [("traction_track_width", float(np.ptp(across))), ("steering_track_width", float(np.ptp(beside)))]
+    widths = {"traction_track_width": float(np.ptp(across)), "steering_track_width": float(np.ptp(beside))}
     return Controller(
         name,
-        (
-            Parameter("traction_joints_names", tuple(map(joint_name, rear)), "right, left" if len(rear) > 1 else ""),
-            Parameter(
-                "steering_joints_names",
-                tuple(f"steering_{wheel}_joint" for wheel in front),
-                "right, left" if len(front) > 1 else "",
-            ),
-            Parameter("wheelbase", wheelbase, "m"),
-            *(Parameter(key, width * share, "m") for key, width in widths if width),
-            Parameter("traction_wheel_radius" if len(rear) == 1 else "traction_wheels_radius", radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "traction_joints_names": [joint_name(wheel) for wheel in rear],
+            "steering_joints_names": [f"steering_{wheel}_joint" for wheel in front],
+            "wheelbase": wheelbase,
+            **{name: width * share for name, width in widths.items() if width},
+            "traction_wheel_radius" if len(rear) == 1 else "traction_wheels_radius": radius,
+        },
         np.diag([radius, 0.0, turn])[:, [0, 2]] @ reading,
         "one wheel radius and one wheelbase",
         "traction_joints_names and steering_joints_names",
@@ -497,17 +434,14 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
         notes += (f"the rollers form an O seen from above, so that {', '.join(elsewhere)}",)
     return Controller(
         "mecanum_drive_controller",
-        (
-            *(
-                Parameter(f"{corner}_wheel_command_joint_name", joint_name(robot.wheel_names[index]))
-                for corner, index in wheels.items()
-            ),
-            Parameter("kinematics.base_frame_offset.x", offset.real, "m"),
-            Parameter("kinematics.base_frame_offset.y", offset.imag, "m"),
-            Parameter("kinematics.base_frame_offset.theta", theta, "rad"),
-            Parameter("kinematics.wheels_radius", radius, "m"),
-            Parameter("kinematics.sum_of_robot_center_projection_on_X_Y_axis", radius / turn, "m"),
-        ),
+        {
+            **{corner: joint_name(robot.wheel_names[index]) for corner, index in wheels.items()},
+            "kinematics.base_frame_offset.x": offset.real,
+            "kinematics.base_frame_offset.y": offset.imag,
+            "kinematics.base_frame_offset.theta": theta,
+            "kinematics.wheels_radius": radius,
+            "kinematics.sum_of_robot_center_projection_on_X_Y_axis": radius / turn,
+        },
         twist @ np.diag([radius, radius, turn]) @ reading,
         "one wheel radius, one sum of distances and one pose of the base frame",
         "joint names",
@@ -610,7 +544,6 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
 def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
     """The controller closest to a matrix (3, N) of the robot's centre. ConfigError: it cannot describe this robot."""
     fitted = closest_omni_wheel_drive(robot, matrix)
-    names = ", ".join(joint_name(robot.wheel_names[index]) for index in fitted.order)
     off = 100 * (fitted.matrix - matrix) / np.abs(matrix).max(axis=1, keepdims=True)
     rows = "; ".join(", ".join(f"{value:+.2f}" for value in row) for row in off)
     sign = (
@@ -622,20 +555,18 @@ def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
         sign += f", but not of {', '.join(as_they_are)}"
     return Controller(
         "omni_wheel_drive_controller",
-        (
-            Parameter("wheel_names", f"[{names}]", "counter-clockwise"),
-            Parameter("wheel_offset", fitted.wheel_offset, "rad"),
-            Parameter("robot_radius", fitted.robot_radius, "m"),
-            Parameter("wheel_radius", fitted.wheel_radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "wheel_names": [joint_name(robot.wheel_names[index]) for index in fitted.order],
+            "wheel_offset": fitted.wheel_offset,
+            "robot_radius": fitted.robot_radius,
+            "wheel_radius": fitted.wheel_radius,
+        },
         fitted.matrix,
         "one wheel radius, one distance and equal spacing",
         "wheel_names",
         f": its elements are off by ({rows}) % of their row's largest, rows x; y; heading, wheels "
         f"{', '.join(robot.wheel_names)}",
         (sign,),
-        covariances="diagonal_covariance.{}",
     )
 
 
@@ -673,13 +604,12 @@ def tricycle(robot: Robot, matrix: Array) -> Controller:
     offset = _steering_offset(robot, seen, reading, base, abs(wheelbase))
     return Controller(
         "tricycle_controller",
-        (
-            Parameter("traction_joint_name", joint_name(name)),
-            Parameter("steering_joint_name", f"steering_{name}_joint"),
-            Parameter("wheelbase", radius / turn, "m"),
-            Parameter("wheel_radius", radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "traction_joint_name": joint_name(name),
+            "steering_joint_name": f"steering_{name}_joint",
+            "wheelbase": radius / turn,
+            "wheel_radius": radius,
+        },
         _tricycle_matrix(radius, turn, 0.0) @ reading,
         "one wheel radius and one wheelbase",
         "traction_joint_name and steering_joint_name",
