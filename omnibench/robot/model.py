@@ -75,7 +75,13 @@ class EffectStream(OdometryStream):
             displaced = drift[0] * duration
             added = complex(displaced[0], displaced[1]) * turn
             self.pose = self.pose + np.array([added.real, added.imag, 0.0])
-            moved = moved + self._in_body(added, before[2], moved[2])
+            # The motion in the robot's frame that displaces the end of the sample by that
+            half = moved[2] / 2 if self.integration == "arc" else 0.0
+            stretch = math.sin(half) / half if half else 1.0
+            if abs(stretch) >= _NO_STRETCH:
+                direction = before[2] + half
+                in_body = added * complex(math.cos(direction), -math.sin(direction)) / stretch
+                moved = moved + np.array([in_body.real, in_body.imag, 0.0])
         self.moved, self._left_at, self.doubts = moved, self.pose, None
         if doubts is not None:
             # From deviations (5, r) of twist and drift to those (3, r) of the motion in the robot's frame.
@@ -84,15 +90,6 @@ class EffectStream(OdometryStream):
             of_drift = np.array([[cosine, sine], [-sine, cosine], [0.0, 0.0]]) @ deviations[3:]
             self.doubts = deviations[:3] + of_drift
         return self.pose
-
-    def _in_body(self, displacement: complex, heading: float, turned: float) -> Array:
-        """Motion (3,) in the robot's frame that displaces the end of a sample which begins at ``heading`` and turns."""
-        half = turned / 2 if self.integration == "arc" else 0.0
-        stretch = math.sin(half) / half if half else 1.0
-        if abs(stretch) < _NO_STRETCH:
-            return np.zeros(3)
-        in_body = displacement * complex(math.cos(heading + half), -math.sin(heading + half)) / stretch
-        return np.array([in_body.real, in_body.imag, 0.0])
 
 
 @dataclass(frozen=True, eq=False)

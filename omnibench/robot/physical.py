@@ -177,8 +177,7 @@ class Geometry:
         """Derivatives (3M, n) of the matrix elements, row by row, by central differences."""
         steps = _STEP * np.diag(self.scale)
         difference = self.matrices(vector + steps) - self.matrices(vector - steps)
-        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
-        return slopes
+        return (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
 
     def _matrices_of_centre(self, of_number: Mapping[str, Array]) -> Array:
         """Matrices (P, 3, M) of the robot's centre, from the values (P,) of each number."""
@@ -202,14 +201,15 @@ class Geometry:
         for wheel in robot.measured:
             radius = of_number[f"radius_{wheel.name}"]
             if wheel.has_steering:
-                rows += _steered_rows(radius, *(of_number[f"{kind}_{wheel.name}"] for kind in ("x", "y", "offset")))
+                # The two rows of its signals, Eq. (K1) of kinematics.py, turned by the offset
+                steered = _twists(*(of_number[f"{kind}_{wheel.name}"] for kind in ("x", "y", "offset")))
+                rows += [steered[:, row] / radius[:, None] for row in (0, 1)]
             else:
                 angle = of_number.get(f"angle_{wheel.name}", np.full(len(radius), wheel.axle))
                 distance = of_number[f"distance_{wheel.name}"]
                 rows.append(kinematics.wheel_rows(radius, distance, angle, np.array(wheel.roller_angle)))
         basis = robot.allowed_basis
-        inverse: Array = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
-        return inverse
+        return basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
 
 
 def _twists(x: Array, y: Array, yaw: Array) -> Array:
@@ -222,14 +222,6 @@ def _twists(x: Array, y: Array, yaw: Array) -> Array:
         [zero, zero, one],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _steered_rows(radius: Array, x: Array, y: Array, offset: Array) -> list[Array]:
-    """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (K1) of kinematics.py, turned."""
-    cosine, sine = np.cos(offset), np.sin(offset)
-    along = np.stack([cosine, sine, x * sine - y * cosine], axis=-1) / radius[:, None]
-    across = np.stack([-sine, cosine, x * cosine + y * sine], axis=-1) / radius[:, None]
-    return [along, across]
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +431,8 @@ def _doubt(robot: Robot, parameters: Sequence[PhysicalParameter], fitted_mount: 
         ends = (each.low, each.high) if each.low is not None and each.high is not None else (each.value, each.value)
         nearest = min(max(each.design, ends[0]), ends[1])
         effective = each.name == "track" and robot.skid  # of wheels that slide
-        if each.name.startswith(_LENGTHS) and not effective and abs(nearest / each.design - 1) > _IMPLAUSIBLE:
+        is_length = each.name.startswith(_LENGTHS) and each.design and not effective
+        if is_length and abs(nearest / each.design - 1) > _IMPLAUSIBLE:
             doubted.append(f"{each.name} {each.deviation_percent:+.1f} %")
     if not doubted:
         return ""

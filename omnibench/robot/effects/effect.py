@@ -434,7 +434,8 @@ def make_term(
         is_form = isinstance(effect, MotionEffect) and accepts_form(effect, robot, key)
         if key not in listed and not effect.accepts(key) and not is_form:
             raise UnknownNameError("parameter", key, listed, prefix)
-        if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+        number: Any = value
+        if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
             raise DataError(f"{prefix}: parameter {key!r} is {value!r}, not a finite number")
         # Its range, or that of the parameter whose form it is of, or of a covariate's scale; else of an unknown session
         formed = key.partition(":")[0]

@@ -114,8 +114,7 @@ def bump(places: Array, values: Values) -> Array:
 
 def across(places: Array, values: Values) -> Array:
     """Distances (F,) of positions (F, 2) from a line, on the side of its normal positive, m."""
-    distances: Array = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
-    return distances
+    return places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
 
 
 def beyond(places: Array, values: Values) -> Array:
@@ -326,8 +325,7 @@ def smooth_session_wave(signals: Signals, values: Values) -> Array:
 def smooth_order_of_runs(signals: Signals, values: Values) -> Array:
     """Unknown effect: polynomials of the time since the session's start; after the longest seen the value is held."""
     unit = np.clip(2 * needed(signals.session_time) / values["duration"] - 1, -1.0, 1.0)
-    functions: Array = chebyshev.chebvander(unit, 12)[:, 1:]
-    return functions
+    return chebyshev.chebvander(unit, 12)[:, 1:]
 
 
 def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
@@ -338,8 +336,7 @@ def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
     """
     half = harmonic / 2 * signals.durations
     amplitude = np.sin(half * signals.rates[:, wheel]) / half
-    means: Array = amplitude[:, None] * waves(needed(signals.wheel_angles)[:, wheel], (harmonic,))
-    return means
+    return amplitude[:, None] * waves(needed(signals.wheel_angles)[:, wheel], (harmonic,))
 
 
 def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
@@ -531,8 +528,7 @@ class BentMap(WithoutCause, ReferenceEffect):
         """Shift (K, 3) of reported poses relative to the shift of the start, m, m, rad."""
         factors = np.array([[values[f"{axis}_{label}"] for label in self.labels] for axis in _AXES])
         there = self.functions(poses[:, :2], values) - self.functions(start[None, :2], values)
-        shift: Array = there @ factors.T
-        return shift
+        return there @ factors.T
 
 
 def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:

@@ -463,8 +463,7 @@ class DrivenSteeringOffset(MotionEffect):
 
 def _driving(rates: Array) -> NDArray[np.bool_]:
     """True for samples (F,) in which a wheel turns."""
-    driving: NDArray[np.bool_] = np.abs(rates).max(axis=1) > STILL
-    return driving
+    return np.abs(rates).max(axis=1) > STILL
 
 
 @effects.register("heading_drift")

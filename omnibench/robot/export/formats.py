@@ -24,7 +24,7 @@ from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.effects.textbook import KNEE
 from omnibench.robot.export import ros2_controllers
 from omnibench.robot.export.ros2_controllers import Controller, RemainingError, interval_in_words
-from omnibench.robot.kinematics import CarDrive, Mount
+from omnibench.robot.kinematics import Mount
 from omnibench.views import Brief
 
 if TYPE_CHECKING:
@@ -75,18 +75,14 @@ def _nodes(calibration: Calibration, fitted: Controller | None, base: Mount, **c
     content: what the template needs beside the controller and its covariances.
     """
     pose = ros2_controllers.pose_variances(calibration, base)
-    return (
-        _environment()
-        .get_template("node_parameters.yaml.j2")
-        .render(
-            calibration=calibration,
-            controller=fitted,
-            values=None if fitted is None else fitted.values,
-            pose_variances=pose,
-            twist_variances=None if pose is None else pose / calibration.sample_period,
-            interval=interval_in_words(calibration),
-            **content,
-        )
+    template = _environment().get_template("node_parameters.yaml.j2")
+    return template.render(
+        calibration=calibration,
+        controller=fitted,
+        pose_variances=pose,
+        twist_variances=None if pose is None else pose / calibration.sample_period,
+        interval=interval_in_words(calibration),
+        **content,
     )
 
 
@@ -180,23 +176,16 @@ def _c_header(calibration: Calibration) -> Export:
         name: 0 if plain else sum(term.parameters[parameter] for term in calibration.effects if term.name == name)
         for name, parameter in _IN_HEADER.items()
     }
-    text = (
-        _environment()
-        .get_template("odometry.h.j2")
-        .render(
-            calibration=calibration,
-            left_out=left_out(calibration),
-            prefix=prefix,
-            upper=prefix.upper(),
-            drive=robot.drive,
-            ahead=float(np.mean(robot.drive.ahead, axis=0)[0]) if isinstance(robot.drive, CarDrive) else None,
-            matrix=(calibration.matrix_without_effects if plain else calibration.matrix_array).tolist(),
-            counter_clockwise=all(wheel.lever > 0 for wheel in robot.measured),
-            lost=held["wheel_dead_zone"],
-            knee=KNEE,
-            gain=1 + held["steering_gain"],
-            zero=held["steering_offset"],
-        )
+    template = _environment().get_template("odometry.h.j2")
+    text = template.render(
+        calibration=calibration,
+        left_out=left_out(calibration),
+        prefix=prefix,
+        matrix=(calibration.matrix_without_effects if plain else calibration.matrix_array).tolist(),
+        lost=held["wheel_dead_zone"],
+        knee=KNEE,
+        gain=1 + held["steering_gain"],
+        zero=held["steering_offset"],
     )
     warnings = []
     if omitted := left_out(calibration):

@@ -173,8 +173,7 @@ def remaining_errors(robot: Robot, used: Array, true: Array, base: Mount | None 
     base: the frame of the robot that both matrices are of; default: its centre.
     """
     motions, signals = driven_motions(robot, base)
-    errors: Array = (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
-    return errors
+    return (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
 
 
 def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
@@ -185,8 +184,7 @@ def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
         K U (A U)^-1.                                                                                  (2)
     """
     _, signals = driven_motions(robot)
-    seen: Array = matrix @ signals @ np.linalg.inv(reading @ signals)
-    return seen
+    return matrix @ signals @ np.linalg.inv(reading @ signals)
 
 
 def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Array]:
@@ -206,8 +204,7 @@ def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Arra
 
 def of_centre(robot: Robot, matrix: Array) -> Array:
     """The matrix (3, M) of a robot's centre from that of its tracked point."""
-    centre: Array = matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
-    return centre
+    return matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
 
 
 def pose_variances(calibration: Calibration, base: Mount) -> Array | None:
@@ -236,15 +233,13 @@ def matrix_deviations(calibration: Calibration, base: Mount) -> Array | None:
     blocks = np.array(calibration.covariance)[: 3 * count, : 3 * count].reshape(3, count, 3, count)
     _, signals = driven_motions(calibration.robot, base)
     variances = np.einsum("ai,aj,imjn,md,nd->da", frame, frame, blocks, signals, signals, optimize=True)
-    deviations: Array = np.sqrt(np.maximum(variances, 0.0))
-    return deviations
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def _from_tracked(calibration: Calibration, base: Mount) -> Array:
     """F (3, 3): the twist of a frame of the robot from that of the tracked point."""
     mount = calibration.robot.mount
-    frame: Array = base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
-    return frame
+    return base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
 
 
 def joint_name(wheel: str) -> str:
@@ -274,13 +269,30 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
     and R_r = B k_3r hold distances and headings of rows 1 and 3 exactly, for a frame in the middle between these
     points. What is left is its lever arm, which displaces the robot where it turns and does not add up.
     """
-    sides = _sides(robot)
+    # The fixed wheels on the left and on the right of their middle
+    fixed = [index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"]
+    askew = [robot.wheel_names[index] for index in fixed if abs(math.cos(robot.measured[index].rolling)) < _ALONG]
+    if askew:
+        raise ConfigError(
+            f"ros2_controllers: diff_drive_controller needs wheels that roll along x, and {', '.join(askew)} do not; "
+            "turn the robot's frame, or use c_header"
+        )
+    places = np.array([wheel.position for wheel in robot.measured])
+    middle = (places[fixed, 1].max() + places[fixed, 1].min()) / 2
+    sides = (
+        [index for index in fixed if places[index, 1] > middle],
+        [index for index in fixed if places[index, 1] <= middle],
+    )
+    if not sides[0] or len(sides[0]) != len(sides[1]):
+        raise ConfigError(
+            "ros2_controllers: diff_drive_controller needs as many measured wheels on the left as on the right, found "
+            f"{len(sides[0])} and {len(sides[1])}; use c_header"
+        )
     forward = [math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured]
     reading = np.zeros((2, len(robot.measured)))
     for row, side in enumerate(sides):
         for index in side:
             reading[row, index] = forward[index] / len(side)
-    places = np.array([wheel.position for wheel in robot.measured])
     middles = np.array([places[side].mean(axis=0) for side in sides])
     base, apart = Mount(x=middles[:, 0].mean(), y=middles[:, 1].mean()), float(middles[0, 1] - middles[1, 1])
     ahead, _, turning = base.twist @ as_read(robot, matrix, reading)
@@ -310,27 +322,6 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
         notes=joint_notes([name for name in backwards if name not in unread], unread),
         base=base,
     )
-
-
-def _sides(robot: Robot) -> tuple[list[int], list[int]]:
-    """Indices of the fixed wheels on the left and on the right of their middle."""
-    fixed = [index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"]
-    askew = [robot.wheel_names[index] for index in fixed if abs(math.cos(robot.measured[index].rolling)) < _ALONG]
-    if askew:
-        raise ConfigError(
-            f"ros2_controllers: diff_drive_controller needs wheels that roll along x, and {', '.join(askew)} do not; "
-            "turn the robot's frame, or use c_header"
-        )
-    across = np.array([robot.measured[index].position[1] for index in fixed])
-    middle = (across.max() + across.min()) / 2
-    left = [index for index, y in zip(fixed, across, strict=True) if y > middle]
-    right = [index for index in fixed if index not in left]
-    if not left or len(left) != len(right):
-        raise ConfigError(
-            "ros2_controllers: diff_drive_controller needs as many measured wheels on the left as on the right, found "
-            f"{len(left)} and {len(right)}; use c_header"
-        )
-    return left, right
 
 
 def car(robot: Robot, drive: CarDrive, matrix: Array) -> Controller:
@@ -410,7 +401,19 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
     i e^(-i theta) (x + iy) r / k, and row 3 is (0, 0, r / k): so the closest parameters in the sum of squares are found
     in closed form.
     """
-    wheels, signs = _corners(robot)
+    # The wheel in each corner of the controller, and the sign (N,) of each wheel's rate driving forward
+    equations = robot.signal_equations
+    signs, found = np.sign(equations[:, 0]), dict[str, int]()
+    for index, (sign, row) in enumerate(zip(signs, equations, strict=True)):
+        corner = next((name for name, pattern in _CORNERS.items() if (sign * np.sign(row) == pattern).all()), None)
+        if corner is not None and robot.measured[index].kind == "mecanum":
+            found[corner] = index
+    if len(found) < 4 or len(robot.measured) > 4:
+        raise ConfigError(
+            "ros2_controllers: mecanum_drive_controller needs one mecanum wheel in each corner, with rollers that form "
+            f"an X or an O seen from above; {', '.join(robot.wheel_names)} do not; check roller angles, or use c_header"
+        )
+    wheels = {corner: found[corner] for corner in _CORNERS}
     reading = np.zeros((3, len(robot.measured)))
     for corner, index in wheels.items():
         reading[:, index] = signs[index] * np.array(_CORNERS[corner]) / 4
@@ -451,56 +454,30 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
     )
 
 
-def _corners(robot: Robot) -> tuple[dict[str, int], list[float]]:
-    """The wheel (index) in each corner of the controller, and the sign (N,) of each wheel's rate driving forward."""
-    equations = robot.signal_equations
-    signs = np.sign(equations[:, 0])
-    wheels = {}
-    for index, (sign, row) in enumerate(zip(signs, equations, strict=True)):
-        corner = next((name for name, pattern in _CORNERS.items() if (sign * np.sign(row) == pattern).all()), None)
-        if corner is not None and robot.measured[index].kind == "mecanum":
-            wheels[corner] = index
-    if len(wheels) < 4 or len(robot.measured) > 4:
-        raise ConfigError(
-            "ros2_controllers: mecanum_drive_controller needs one mecanum wheel in each corner, with rollers that form "
-            f"an X or an O seen from above; {', '.join(robot.wheel_names)} do not; check roller angles, or use c_header"
-        )
-    return {corner: wheels[corner] for corner in _CORNERS}, signs.tolist()
-
-
-@dataclass(frozen=True)
-class OmniWheelDrive:
-    """The parameters of omni_wheel_drive_controller: order of the wheels (indices), radii in m, offset in rad.
+def omni_wheel_matrix(
+    order: Sequence[int], robot_radius: float, wheel_radius: float, wheel_offset: float, clockwise: Sequence[bool] = ()
+) -> Array:
+    """The inverse kinematic matrix (3, N) of omni_wheel_drive_controller, columns in the robot's order.
 
     The controller solves, by least squares over its wheels i = 0 .. N-1, counted counter-clockwise,
 
         wheel_radius * omega_i = sin(t_i) vx - cos(t_i) vy - robot_radius w,    t_i = wheel_offset + 2 pi i / N     (6)
 
     (odometry.cpp of the package, 2025), which with omega_i negated is the wheel equation of omnibench: its positive
-    rate turns the robot clockwise. clockwise (N,): True for a wheel whose positive rate turns the robot clockwise, as
-    the controller has it.
+    rate turns the robot clockwise. order: indices of the wheels. Radii in m, offset in rad. clockwise (N,): True for a
+    wheel whose positive rate turns the robot clockwise, as the controller has it; default: none.
     """
-
-    order: tuple[int, ...]
-    robot_radius: float
-    wheel_radius: float
-    wheel_offset: float
-    clockwise: tuple[bool, ...] = ()
-
-    @property
-    def matrix(self) -> Array:
-        """The inverse kinematic matrix (3, N) that the controller uses, columns in the robot's order."""
-        count = len(self.order)
-        angles = self.wheel_offset + 2 * np.pi * np.arange(count) / count
-        matrix = np.empty((3, count))
-        matrix[0, self.order] = -2 * self.wheel_radius / count * np.sin(angles)
-        matrix[1, self.order] = 2 * self.wheel_radius / count * np.cos(angles)
-        matrix[2, self.order] = self.wheel_radius / (count * self.robot_radius)
-        return np.where(self.clockwise, -matrix, matrix) if self.clockwise else matrix
+    count = len(order)
+    angles = wheel_offset + 2 * np.pi * np.arange(count) / count
+    matrix = np.empty((3, count))
+    matrix[0, order] = -2 * wheel_radius / count * np.sin(angles)
+    matrix[1, order] = 2 * wheel_radius / count * np.cos(angles)
+    matrix[2, order] = wheel_radius / (count * robot_radius)
+    return np.where(clockwise, -matrix, matrix) if clockwise else matrix
 
 
-def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
-    """The parameters whose matrix is closest to ``matrix`` (3, N) in the sum of squares of each row.
+def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
+    """The controller whose matrix is closest to ``matrix`` (3, N) of the robot's centre in the sum of squares of rows.
 
     The matrix of Eq. (6) is, in columns,
 
@@ -516,7 +493,7 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     if count < 3:
         raise ConfigError("ros2_controllers: omni_wheel_drive_controller needs three wheels or more; use c_header")
     # Order counter-clockwise from the first wheel on.
-    clockwise = tuple(wheel.lever < 0 for wheel in wheels)
+    clockwise = [wheel.lever < 0 for wheel in wheels]
     angles = np.array([wheel.axle if wheel.lever > 0 else wheel.axle + math.pi for wheel in wheels])
     turned = np.mod(angles - angles[0], 2 * np.pi)
     # By rounding, the first wheel or one at the same angle may be a full turn away.
@@ -536,32 +513,25 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     turn = float(columns[2].mean())
     if turn <= 0 or abs(scaled) == 0:
         raise ConfigError(_NO_TURN)
-    return OmniWheelDrive(
-        tuple(order.tolist()), abs(scaled) / (count * turn), abs(scaled), float(np.angle(scaled)), clockwise
-    )
-
-
-def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, N) of the robot's centre. ConfigError: it cannot describe this robot."""
-    fitted = closest_omni_wheel_drive(robot, matrix)
-    off = 100 * (fitted.matrix - matrix) / np.abs(matrix).max(axis=1, keepdims=True)
+    values = {
+        "wheel_offset": float(np.angle(scaled)),
+        "robot_radius": abs(scaled) / (count * turn),
+        "wheel_radius": abs(scaled),
+    }
+    closest = omni_wheel_matrix(order.tolist(), **values, clockwise=clockwise)
+    off = 100 * (closest - matrix) / np.abs(matrix).max(axis=1, keepdims=True)
     rows = "; ".join(", ".join(f"{value:+.2f}" for value in row) for row in off)
     sign = (
         "a positive joint velocity turns the robot clockwise for this controller, counter-clockwise for the "
         "calibration: reverse the joints' axes"
     )
-    if any(fitted.clockwise):
-        as_they_are = [name for name, turns in zip(robot.wheel_names, fitted.clockwise, strict=True) if turns]
+    if any(clockwise):
+        as_they_are = [name for name, turns in zip(robot.wheel_names, clockwise, strict=True) if turns]
         sign += f", but not of {', '.join(as_they_are)}"
     return Controller(
         "omni_wheel_drive_controller",
-        {
-            "wheel_names": [joint_name(robot.wheel_names[index]) for index in fitted.order],
-            "wheel_offset": fitted.wheel_offset,
-            "robot_radius": fitted.robot_radius,
-            "wheel_radius": fitted.wheel_radius,
-        },
-        fitted.matrix,
+        {"wheel_names": [joint_name(robot.wheel_names[index]) for index in order], **values},
+        closest,
         "one wheel radius, one distance and equal spacing",
         "wheel_names",
         f": its elements are off by ({rows}) % of their row's largest, rows x; y; heading, wheels "
