@@ -281,17 +281,13 @@ def correction_of(effect: MotionEffect, signals: Signals, values: Values) -> Arr
     return correction
 
 
-def accepts_form(effect: MotionEffect, robot: Robot, name: str) -> bool:
-    """True for the name of a value of one of the effect's forms."""
-    first, _, rest = name.partition(":")
-    if first in form_covariates(effect):
-        return rest in ("low", "high", *(f"mean_{power}" for power in _POWERS))
-    if first not in {parameter.name for parameter in _linear(effect, robot)}:
-        return False
-    covariate, _, last = rest.rpartition(":")
-    if covariate == "wheel":
-        return last in _unequal_wheels(effect, robot)
-    return covariate in form_covariates(effect) and last in map(str, _POWERS)
+def form_names(effect: MotionEffect, robot: Robot) -> set[str]:
+    """Names of the values of all forms of the effect."""
+    covariates, linear = form_covariates(effect), [parameter.name for parameter in _linear(effect, robot)]
+    forms = [f"{covariate}:{power}" for covariate in covariates for power in _POWERS]
+    forms += [f"wheel:{wheel}" for wheel in _unequal_wheels(effect, robot)]
+    scales = {f"{covariate}:{key}" for covariate in covariates for key in ("low", "high", "mean_1", "mean_2")}
+    return scales | {f"{name}:{form}" for name in linear for form in forms}
 
 
 def form_in_words(values: Values) -> str:
@@ -430,9 +426,9 @@ def make_term(
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
     check_applies(effect, robot, prefix)
     listed = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
+    forms = form_names(effect, robot) if isinstance(effect, MotionEffect) else set()
     for key, value in parameters.items():
-        is_form = isinstance(effect, MotionEffect) and accepts_form(effect, robot, key)
-        if key not in listed and not effect.accepts(key) and not is_form:
+        if key not in listed and key not in forms and not effect.accepts(key):
             raise UnknownNameError("parameter", key, listed, prefix)
         number: Any = value
         if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omnibench.errors import ConfigError, UnknownNameError, one_line, require_type
-from omnibench.robot.calibration import Calibration, Noise
+from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.textbook import KNEE
 from omnibench.robot.export import ros2_controllers
 from omnibench.robot.export.ros2_controllers import Controller, RemainingError, interval_in_words
@@ -121,24 +121,6 @@ def robot_localization(calibration: Calibration) -> Export:
             f"robot_localization: calibration {calibration.name!r} has no noise model, of which covariances are made; "
             "calibrate once more with closed_form, which estimates it"
         )
-    warnings = _warnings(calibration, noise, base)
-    along_x, along_y, heading = np.sqrt(growth).tolist()
-    text = _nodes(
-        calibration,
-        publisher,
-        base,
-        what="robot_localization",
-        relation="from",
-        warnings=warnings,
-        last=f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
-        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
-        fused=["true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE))],
-        process_noise=np.diag(_PROCESS_NOISE).tolist(),
-    )
-    return Export(text, warnings, f"{_stem(calibration.name)}_robot_localization.yaml")
-
-
-def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
     interval = interval_in_words(calibration)
     warnings = [
         f"twist variances are of messages every {interval}; for another interval T multiply them by {interval} / T",
@@ -153,19 +135,32 @@ def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str,
     deviations = ros2_controllers.matrix_deviations(calibration, base)
     if deviations is None:
         warnings.append("the calibration has no covariance of its matrix: how far that may be off is not known")
-        return tuple(warnings)
-    # Standard deviations in the worst direction of straight driving and on the spot.
-    positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
-    headings = deviations[:, 2].tolist()
-    sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
-    warnings.append(
-        f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
-        "message stands for it, and is left out"
+    else:
+        # Standard deviations in the worst direction of straight driving and on the spot.
+        positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
+        headings = deviations[:, 2].tolist()
+        sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
+        warnings.append(
+            f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
+            "message stands for it, and is left out"
+        )
+        if calibration.provenance is not None and calibration.provenance.on_bounds:
+            names = ", ".join(calibration.provenance.on_bounds)
+            warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
+    along_x, along_y, heading = np.sqrt(growth).tolist()
+    text = _nodes(
+        calibration,
+        publisher,
+        base,
+        what="robot_localization",
+        relation="from",
+        warnings=warnings,
+        last=f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
+        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
+        fused=["true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE))],
+        process_noise=np.diag(_PROCESS_NOISE).tolist(),
     )
-    if calibration.provenance is not None and calibration.provenance.on_bounds:
-        names = ", ".join(calibration.provenance.on_bounds)
-        warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
-    return tuple(warnings)
+    return Export(text, tuple(warnings), f"{_stem(calibration.name)}_robot_localization.yaml")
 
 
 def _c_header(calibration: Calibration) -> Export:
