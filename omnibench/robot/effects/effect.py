@@ -426,7 +426,9 @@ def make_term(
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
     check_applies(effect, robot, prefix)
     listed = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
-    forms = form_names(effect, robot) if isinstance(effect, MotionEffect) else set()
+    forms = set[str]()
+    if isinstance(effect, MotionEffect) and any(":" in key for key in parameters):
+        forms = form_names(effect, robot)
     for key, value in parameters.items():
         if key not in listed and key not in forms and not effect.accepts(key):
             raise UnknownNameError("parameter", key, listed, prefix)

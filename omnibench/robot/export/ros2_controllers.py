@@ -270,7 +270,7 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
     points. What is left is its lever arm, which displaces the robot where it turns and does not add up.
     """
     # The fixed wheels on the left and on the right of their middle
-    fixed = [index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"]
+    fixed = np.array([index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"])
     askew = [robot.wheel_names[index] for index in fixed if abs(math.cos(robot.measured[index].rolling)) < _ALONG]
     if askew:
         raise ConfigError(
@@ -278,22 +278,18 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
             "turn the robot's frame, or use c_header"
         )
     places = np.array([wheel.position for wheel in robot.measured])
-    middle = (places[fixed, 1].max() + places[fixed, 1].min()) / 2
-    sides = (
-        [index for index in fixed if places[index, 1] > middle],
-        [index for index in fixed if places[index, 1] <= middle],
-    )
-    if not sides[0] or len(sides[0]) != len(sides[1]):
+    across = places[fixed, 1]
+    on_left = across > (across.max() + across.min()) / 2
+    left, right = fixed[on_left], fixed[~on_left]
+    if not len(left) or len(left) != len(right):
         raise ConfigError(
             "ros2_controllers: diff_drive_controller needs as many measured wheels on the left as on the right, found "
-            f"{len(sides[0])} and {len(sides[1])}; use c_header"
+            f"{len(left)} and {len(right)}; use c_header"
         )
-    forward = [math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured]
+    forward = np.array([math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured])
     reading = np.zeros((2, len(robot.measured)))
-    for row, side in enumerate(sides):
-        for index in side:
-            reading[row, index] = forward[index] / len(side)
-    middles = np.array([places[side].mean(axis=0) for side in sides])
+    reading[0, left], reading[1, right] = forward[left] / len(left), forward[right] / len(right)
+    middles = np.array([places[left].mean(axis=0), places[right].mean(axis=0)])
     base, apart = Mount(x=middles[:, 0].mean(), y=middles[:, 1].mean()), float(middles[0, 1] - middles[1, 1])
     ahead, _, turning = base.twist @ as_read(robot, matrix, reading)
     separation = float(np.diff(ahead / turning)[0]) if turning[0] < 0 < turning[1] else 0.0
@@ -301,15 +297,15 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
         raise ConfigError(f"{_WRONG_WAY}wheel signs and which wheels are on the left")
     radii = separation * turning * (-1, 1)
     by_side = np.array([[radii[0] / 2, radii[1] / 2], [0.0, 0.0], [-radii[0] / separation, radii[1] / separation]])
-    radius = float(robot.radii[[*sides[0], *sides[1]]].mean())
-    left, right = ([robot.wheel_names[index] for index in side] for side in sides)
-    backwards = [name for name, sign in zip(robot.wheel_names, forward, strict=True) if sign < 0]
-    unread = [name for name in robot.wheel_names if name not in left + right]
+    read = [*left, *right]
+    radius = float(robot.radii[read].mean())
+    backwards = [name for index, name in enumerate(robot.wheel_names) if index in read and forward[index] < 0]
+    unread = [name for index, name in enumerate(robot.wheel_names) if index not in read]
     return Controller(
         "diff_drive_controller",
         {
-            "left_wheel_names": [joint_name(name) for name in left],
-            "right_wheel_names": [joint_name(name) for name in right],
+            "left_wheel_names": [joint_name(robot.wheel_names[index]) for index in left],
+            "right_wheel_names": [joint_name(robot.wheel_names[index]) for index in right],
             "wheel_separation": apart,
             "wheel_radius": radius,
             "wheel_separation_multiplier": separation / apart,
@@ -319,7 +315,7 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
         by_side @ reading,
         "two wheel radii and one separation",
         "left_wheel_names and right_wheel_names",
-        notes=joint_notes([name for name in backwards if name not in unread], unread),
+        notes=joint_notes(backwards, unread),
         base=base,
     )
 
