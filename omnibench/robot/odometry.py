@@ -142,7 +142,7 @@ def with_samples(*names: str, **renamed: str) -> Callable[[type[T]], type[T]]:
     def decorate(cls: type[T]) -> type[T]:
         make: Callable[..., None] = cls.__init__
         for attribute, name in in_handle.items():
-            setattr(cls, attribute, _Sampled(name))
+            setattr(cls, attribute, _array_of_samples(name))
             cls.__dataclass_fields__.pop(attribute)  # type: ignore[attr-defined]
 
         @wraps(make)
@@ -158,18 +158,17 @@ def with_samples(*names: str, **renamed: str) -> Callable[[type[T]], type[T]]:
     return decorate
 
 
-class _Sampled:
+def _array_of_samples(name: str) -> property:
     """Attribute whose value is an array of the instance's samples."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def read(instance: Any) -> Any:
+        return instance.samples.array(name)
 
-    def __get__(self, instance: Any, owner: type[Any]) -> Any:
-        return self if instance is None else instance.samples.array(self._name)
-
-    def __set__(self, instance: Any, value: Any) -> None:  # by the constructor alone: the classes are frozen
+    def write(instance: Any, value: Any) -> None:  # by the constructor alone: the classes are frozen
         if value is not _UNCHANGED:
-            vars(instance).setdefault("_given", {})[self._name] = value
+            vars(instance).setdefault("_given", {})[name] = value
+
+    return property(read, write)
 
 
 @with_samples("times", "rates", "steering", wheel_angles="angles")
