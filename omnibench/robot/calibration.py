@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -88,13 +88,6 @@ class EffectTerm(config.Model):
     def of(cls, term: Term) -> EffectTerm:
         """A term of a model, as a file holds it."""
         return cls(name=term.name, parameters=dict(term.values), weights=term.weights)
-
-    @property
-    def numbers_in_words(self) -> Iterator[str]:
-        """The parameters, like ``g 0.1``, and how many weights there are."""
-        yield from (f"{name} {value:.6g}" for name, value in self.parameters.items())
-        if self.weights is not None:
-            yield f"{len(self.weights) * 3 // 16} weights"
 
     def term(self, robot: Robot, where: str = "") -> Term:
         """The term of a robot's model. OmnibenchError as ``make_term``; messages begin with ``where``."""
@@ -392,8 +385,13 @@ class Calibration(Shown, config.Model):
 
     @property
     def effects_in_words(self) -> str:
-        """The effects with their parameters, like ``steering_gain (g 0.1)``."""
-        return ", ".join(f"{term.name} ({', '.join(term.numbers_in_words)})" for term in self.effects)
+        """The effects with their parameters, like ``steering_gain (g 0.1)``, and how many weights there are."""
+        words = []
+        for term in self.effects:
+            numbers = [f"{name} {value:.6g}" for name, value in term.parameters.items()]
+            numbers += [] if term.weights is None else [f"{len(term.weights) * 3 // 16} weights"]
+            words.append(f"{term.name} ({', '.join(numbers)})")
+        return ", ".join(words)
 
     def check_wheels(self, robot: Robot, owner: str, place: str = "") -> None:
         """DataError: the calibration is for other wheels than a robot's, or for wheels that drive it in another way.

@@ -138,8 +138,7 @@ def motions_of(matrix: Array, times: Array, signals: Array) -> Array:
     totals = np.cumsum(np.vstack([np.zeros(3), signals @ matrix.T]), axis=0)
     if len(times) <= width:
         return totals[-1:] / len(times)
-    smooth: Array = (totals[width:] - totals[:-width])[:: max(1, width // 2)] / width
-    return smooth
+    return (totals[width:] - totals[:-width])[:: max(1, width // 2)] / width
 
 
 def representatives(robot: Robot, motions: Array) -> Array:
@@ -203,8 +202,7 @@ class TrainingDomain:
 
     def outside(self, motions: Array) -> NDArray[np.bool_]:
         """True (k,) for each of many motions (k, 3) that is outside."""
-        outside: NDArray[np.bool_] = self.excess(motions) > 0
-        return outside
+        return self.excess(motions) > 0
 
     def outside_in_run(self, motions: Array) -> NDArray[np.bool_]:
         """True (k,) for the motions (k, 3) of one run that are outside; all False where they are mere transitions."""

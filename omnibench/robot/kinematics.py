@@ -282,8 +282,7 @@ class Wheel(Model):
 
 def fastest_rates(radii: Array) -> Array:
     """Rates (N,), rad/s, that no wheels of radii (N,), m, exceed."""
-    rates: Array = np.maximum(FASTEST, FASTEST_RIM / radii)
-    return rates
+    return np.maximum(FASTEST, FASTEST_RIM / radii)
 
 
 @dataclass(frozen=True)
@@ -423,8 +422,7 @@ class CarDrive(Drive):
         """Mean t (F,) of the tangents by which the steering angles (F, S) turn the car, Eq. (D2)."""
         along, across = np.array(self.ahead).T
         tangents = np.tan(steering)
-        mean: Array = (along.mean() * tangents / (along + across * tangents)).mean(axis=1)
-        return mean
+        return (along.mean() * tangents / (along + across * tangents)).mean(axis=1)
 
 
 @lru_cache(maxsize=64)
@@ -446,8 +444,7 @@ def drive_of(wheels: tuple[Wheel, ...]) -> Drive:
 def in_the_middle(steering: Array) -> Array:
     """Steering angles (F, S) in the middles of the samples from those at their ends, rad; the first one holds."""
     before = np.vstack([steering[:1], steering[:-1]])
-    middle: Array = (before + steering) / 2
-    return middle
+    return (before + steering) / 2
 
 
 class Mount(Model):
@@ -576,8 +573,7 @@ class Robot(Shown, Model):
         conditions = np.mean(rows, axis=0, keepdims=True) if self.skid else rows
         _, strengths, directions = np.linalg.svd(conditions)
         rank = int((strengths > _RANK * strengths[0]).sum())
-        allowed: Array = directions[rank:].T
-        return allowed
+        return directions[rank:].T
 
     @property
     def row_scales(self) -> Array:
@@ -622,8 +618,7 @@ class Robot(Shown, Model):
             return np.eye(3)
         line = allowed @ np.array([allowed[2, 1], -allowed[2, 0]])  # the twist of Z that does not turn
         turning = allowed @ allowed[2]  # the one nearest to turning on the spot
-        motions: Array = np.array([motion / motion[np.abs(motion).argmax()] for motion in (line, turning)])
-        return motions
+        return np.array([motion / motion[np.abs(motion).argmax()] for motion in (line, turning)])
 
 
 def _sliding(fixed: Sequence[Wheel]) -> str:
@@ -671,8 +666,7 @@ def _check_car(robot: Robot, drive: CarDrive) -> None:
 def relative_deviations(values: Array, design: Array) -> Array:
     """Shares (values - design) / design; NaN where the design value is 0 but for rounding, as m12 of Eq. (7) of Palacin
     et al. 2023."""
-    shares: Array = (values - design) / np.where(np.abs(design) < _ZERO, np.nan, design)
-    return shares
+    return (values - design) / np.where(np.abs(design) < _ZERO, np.nan, design)
 
 
 def wheel_equations(wheels: Sequence[Wheel]) -> Array:
@@ -834,8 +828,7 @@ def usable_covariances(covariances: Array) -> NDArray[np.bool_]:
     possible = np.asarray((np.abs(covariances) <= _LARGEST_SIGMA**2).all(axis=(-2, -1)))
     filled = np.where(possible[..., None, None], covariances, np.eye(3))
     symmetric = np.isclose(filled, np.swapaxes(filled, -2, -1)).all(axis=(-2, -1))
-    usable: NDArray[np.bool_] = possible & symmetric & (np.linalg.eigvalsh(filled)[..., 0] >= _LEAST_SIGMA**2)
-    return usable
+    return possible & symmetric & (np.linalg.eigvalsh(filled)[..., 0] >= _LEAST_SIGMA**2)
 
 
 def published_matrix(name: str) -> Array:

@@ -75,7 +75,13 @@ class EffectStream(OdometryStream):
             displaced = drift[0] * duration
             added = complex(displaced[0], displaced[1]) * turn
             self.pose = self.pose + np.array([added.real, added.imag, 0.0])
-            moved = moved + self._in_body(added, before[2], moved[2])
+            # The motion in the robot's frame that displaces the end of the sample by that
+            half = moved[2] / 2 if self.integration == "arc" else 0.0
+            stretch = math.sin(half) / half if half else 1.0
+            if abs(stretch) >= _NO_STRETCH:
+                direction = before[2] + half
+                in_body = added * complex(math.cos(direction), -math.sin(direction)) / stretch
+                moved = moved + np.array([in_body.real, in_body.imag, 0.0])
         self.moved, self._left_at, self.doubts = moved, self.pose, None
         if doubts is not None:
             # From deviations (5, r) of twist and drift to those (3, r) of the motion in the robot's frame.
@@ -84,15 +90,6 @@ class EffectStream(OdometryStream):
             of_drift = np.array([[cosine, sine], [-sine, cosine], [0.0, 0.0]]) @ deviations[3:]
             self.doubts = deviations[:3] + of_drift
         return self.pose
-
-    def _in_body(self, displacement: complex, heading: float, turned: float) -> Array:
-        """Motion (3,) in the robot's frame that displaces the end of a sample which begins at ``heading`` and turns."""
-        half = turned / 2 if self.integration == "arc" else 0.0
-        stretch = math.sin(half) / half if half else 1.0
-        if abs(stretch) < _NO_STRETCH:
-            return np.zeros(3)
-        in_body = displacement * complex(math.cos(heading + half), -math.sin(heading + half)) / stretch
-        return np.array([in_body.real, in_body.imag, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,30 +170,27 @@ class OdometryModel:
     def _of_paths(
         self, logs: Sequence[WheelLog], quantity: Callable[[PathBatch, Sequence[Array]], list[Array]]
     ) -> list[Array]:
-        """A quantity of the path of each log at the log's stamps."""
+        """A quantity of the path of each log, under the effects of motion, at the log's stamps."""
         values: list[Array] = [np.empty(0)] * len(logs)
         for together in _blocks(logs):
             part = [logs[index] for index in together]
-            of_part = quantity(self._paths(part), [log.stamps for log in part])
-            for index, of_log in zip(together, of_part, strict=True):
+            samples, world = RunSamples.of([log.times for log in part]), None
+            durations = samples.durations[:, None]
+            if self._corrects:
+                assert self.sample_period is not None  # there are terms
+                for log in part:
+                    check_needs(self.motion_terms, log)
+                needs = needs_of(self.motion_terms)
+                signals = signals_of_runs(part, samples, self.robot, self.matrix, self.sample_period, needs)
+                twists, drift, _ = faded_twists(self.fade, self.motion_terms, signals, self.matrix)
+                world = None if drift is None else drift * durations
+            else:
+                twists = np.concatenate([log.signals for log in part]) @ self.matrix.T
+            starts = np.array([log.start for log in part])
+            paths = PathBatch(samples, starts, twists * durations, self.integration, world)
+            for index, of_log in zip(together, quantity(paths, [log.stamps for log in part]), strict=True):
                 values[index] = of_log
         return values
-
-    def _paths(self, logs: Sequence[WheelLog]) -> PathBatch:
-        """The paths of the logs of one session under the effects of motion."""
-        samples, starts = RunSamples.of([log.times for log in logs]), np.array([log.start for log in logs])
-        durations = samples.durations[:, None]
-        if not self._corrects:
-            driven = np.concatenate([log.signals for log in logs])
-            return PathBatch(samples, starts, (driven @ self.matrix.T) * durations, self.integration)
-        assert self.sample_period is not None  # there are terms
-        for log in logs:
-            check_needs(self.motion_terms, log)
-        needs = needs_of(self.motion_terms)
-        signals = signals_of_runs(logs, samples, self.robot, self.matrix, self.sample_period, needs)
-        twists, drift, _ = faded_twists(self.fade, self.motion_terms, signals, self.matrix)
-        world = None if drift is None else drift * durations
-        return PathBatch(samples, starts, twists * durations, self.integration, world)
 
 
 def _blocks(logs: Sequence[WheelLog]) -> Iterator[list[int]]:

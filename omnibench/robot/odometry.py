@@ -142,7 +142,7 @@ def with_samples(*names: str, **renamed: str) -> Callable[[type[T]], type[T]]:
     def decorate(cls: type[T]) -> type[T]:
         make: Callable[..., None] = cls.__init__
         for attribute, name in in_handle.items():
-            setattr(cls, attribute, _Sampled(name))
+            setattr(cls, attribute, _array_of_samples(name))
             cls.__dataclass_fields__.pop(attribute)  # type: ignore[attr-defined]
 
         @wraps(make)
@@ -158,18 +158,17 @@ def with_samples(*names: str, **renamed: str) -> Callable[[type[T]], type[T]]:
     return decorate
 
 
-class _Sampled:
+def _array_of_samples(name: str) -> property:
     """Attribute whose value is an array of the instance's samples."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def read(instance: Any) -> Any:
+        return instance.samples.array(name)
 
-    def __get__(self, instance: Any, owner: type[Any]) -> Any:
-        return self if instance is None else instance.samples.array(self._name)
-
-    def __set__(self, instance: Any, value: Any) -> None:  # by the constructor alone: the classes are frozen
+    def write(instance: Any, value: Any) -> None:  # by the constructor alone: the classes are frozen
         if value is not _UNCHANGED:
-            vars(instance).setdefault("_given", {})[self._name] = value
+            vars(instance).setdefault("_given", {})[name] = value
+
+    return property(read, write)
 
 
 @with_samples("times", "rates", "steering", wheel_angles="angles")
@@ -250,8 +249,7 @@ class RunSamples:
     @cached_property
     def durations(self) -> Array:
         """Durations (F,) of the samples, s."""
-        durations: Array = self.times - self.begins
-        return durations
+        return self.times - self.begins
 
     def before(self, values: Numbers) -> Numbers:
         """Values (F, ...) of the sample before each sample; 0 of the first ones of the runs."""
@@ -342,15 +340,11 @@ class OdometryBatch:
     def _as_jacobian(self, row_12: Complex, row_3: Complex, driven: Array) -> Array:
         """Derivatives (S, 3, 3, M) from those of x + iy (S, M) by m1 + i m2 and by m3 in the frames of the starts."""
         row_12, row_3 = row_12 * self._turn[:, None], row_3 * self._turn[:, None]
-        zero = np.zeros_like(driven)
-        return np.stack(
-            [
-                np.stack([row_12.real, -row_12.imag, row_3.real], axis=1),
-                np.stack([row_12.imag, row_12.real, row_3.imag], axis=1),
-                np.stack([zero, zero, driven], axis=1),
-            ],
-            axis=1,
-        )
+        jacobian = np.zeros((len(driven), 3, 3, driven.shape[1]))
+        jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = row_12.real, -row_12.imag, row_3.real
+        jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = row_12.imag, row_12.real, row_3.imag
+        jacobian[:, 2, 2] = driven
+        return jacobian
 
     def position_design(self, headings: Iterable[Array]) -> Complex:
         """Regressors (S, M) of (x - x0) + i(y - y0) on m1 + i m2 for given headings.
@@ -382,15 +376,12 @@ class OdometryBatch:
 
     def _displacement(self, matrices: Array) -> Complex:
         """x + iy (P, S) relative to the start, at any stamps."""
-        return np.array(
-            [
-                self._at_stamps(
-                    [self._steps(self._angles, self._before, matrix)[..., None]],
-                    [self._steps(self._piece, self._piece_before, matrix)[..., None]],
-                )[0][:, 0]
-                for matrix in matrices
-            ]
-        )
+        paths = []
+        for matrix in matrices:
+            whole = self._steps(self._angles, self._before, matrix)[..., None]
+            piece = self._steps(self._piece, self._piece_before, matrix)[..., None]
+            paths.append(self._at_stamps([whole], [piece])[0][:, 0])
+        return np.array(paths)
 
     def _at_stamps(self, whole: Sequence[Complex], pieces: Sequence[Complex]) -> tuple[Complex, ...]:
         """Sums (S, n) of the whole samples (T, F, n) before each stamp and the piece (S, n) of the stamp's sample."""

@@ -167,49 +167,44 @@ class Geometry:
 
     def matrices(self, vectors: Array) -> Array:
         """Matrices (P, 3, M) of vectors (P, n) of numbers."""
-        of_number = dict(zip(self.names, vectors.T, strict=True))
-        matrices, mount = self._matrices_of_centre(of_number), vectors[:, -3:]
-        if not (mount == self.design[-3:]).all():
-            return _twists(*mount.T) @ matrices
-        return matrices if self.robot.mount is None else self.robot.mount.twist @ matrices
-
-    def slopes(self, vector: Array) -> Array:
-        """Derivatives (3M, n) of the matrix elements, row by row, by central differences."""
-        steps = _STEP * np.diag(self.scale)
-        difference = self.matrices(vector + steps) - self.matrices(vector - steps)
-        slopes: Array = (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
-        return slopes
-
-    def _matrices_of_centre(self, of_number: Mapping[str, Array]) -> Array:
-        """Matrices (P, 3, M) of the robot's centre, from the values (P,) of each number."""
-        robot = self.robot
+        robot, of_number = self.robot, dict(zip(self.names, vectors.T, strict=True))
         if isinstance(robot.drive, CarDrive):
             radius, wheelbase, offset = (of_number[name][:, None] for name in ("radius", "wheelbase", "offset"))
             matrices = robot.centre_matrix * (radius / robot.radii.mean())[..., None]
             matrices[..., 1] *= float(np.mean(robot.drive.ahead, axis=0)[0]) / wheelbase
             if offset.any():  # tan(phi + c) is tan phi + c near phi = 0
                 matrices[..., 0] += offset * matrices[..., 1]
-            return matrices
-        if all(wheel.kind in ("omni", "mecanum") for wheel in robot.wheels):
-            names = [wheel.name for wheel in robot.measured]
+        elif all(wheel.kind in ("omni", "mecanum") for wheel in robot.wheels):
             radius, distance, angle = (
-                np.stack([of_number[f"{kind}_{name}"] for name in names], axis=1)
+                np.stack([of_number[f"{kind}_{name}"] for name in robot.wheel_names], axis=1)
                 for kind in ("radius", "distance", "angle")
             )
             rollers = [wheel.roller_angle for wheel in robot.measured]
-            return kinematics.inverse_kinematic_matrices(radius, distance, angle, rollers)
-        rows: list[Array] = []
-        for wheel in robot.measured:
-            radius = of_number[f"radius_{wheel.name}"]
-            if wheel.has_steering:
-                rows += _steered_rows(radius, *(of_number[f"{kind}_{wheel.name}"] for kind in ("x", "y", "offset")))
-            else:
-                angle = of_number.get(f"angle_{wheel.name}", np.full(len(radius), wheel.axle))
-                distance = of_number[f"distance_{wheel.name}"]
-                rows.append(kinematics.wheel_rows(radius, distance, angle, np.array(wheel.roller_angle)))
-        basis = robot.allowed_basis
-        inverse: Array = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
-        return inverse
+            matrices = kinematics.inverse_kinematic_matrices(radius, distance, angle, rollers)
+        else:
+            rows: list[Array] = []
+            for wheel in robot.measured:
+                radius = of_number[f"radius_{wheel.name}"]
+                if wheel.has_steering:
+                    # The two rows of its signals, Eq. (K1) of kinematics.py, turned by the offset
+                    steered = _twists(*(of_number[f"{kind}_{wheel.name}"] for kind in ("x", "y", "offset")))
+                    rows += [steered[:, row] / radius[:, None] for row in (0, 1)]
+                else:
+                    angle = of_number.get(f"angle_{wheel.name}", np.full(len(radius), wheel.axle))
+                    distance = of_number[f"distance_{wheel.name}"]
+                    rows.append(kinematics.wheel_rows(radius, distance, angle, np.array(wheel.roller_angle)))
+            basis = robot.allowed_basis
+            matrices = basis @ np.linalg.pinv(np.stack(rows, axis=1) @ basis)
+        mount = vectors[:, -3:]
+        if not (mount == self.design[-3:]).all():
+            return _twists(*mount.T) @ matrices
+        return matrices if robot.mount is None else robot.mount.twist @ matrices
+
+    def slopes(self, vector: Array) -> Array:
+        """Derivatives (3M, n) of the matrix elements, row by row, by central differences."""
+        steps = _STEP * np.diag(self.scale)
+        difference = self.matrices(vector + steps) - self.matrices(vector - steps)
+        return (difference.reshape(len(steps), -1) / (2 * _STEP * self.scale)[:, None]).T
 
 
 def _twists(x: Array, y: Array, yaw: Array) -> Array:
@@ -222,14 +217,6 @@ def _twists(x: Array, y: Array, yaw: Array) -> Array:
         [zero, zero, one],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _steered_rows(radius: Array, x: Array, y: Array, offset: Array) -> list[Array]:
-    """The two rows (P, 3) of a steered wheel, by which a twist gives its signals: Eq. (K1) of kinematics.py, turned."""
-    cosine, sine = np.cos(offset), np.sin(offset)
-    along = np.stack([cosine, sine, x * sine - y * cosine], axis=-1) / radius[:, None]
-    across = np.stack([-sine, cosine, x * cosine + y * sine], axis=-1) / radius[:, None]
-    return [along, across]
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,7 +323,17 @@ def read_matrix(
     point may stand elsewhere than the robot's file says, and its place is among the parameters. unknown (q, 3M):
     changes of the matrix of which the data say nothing; parameters that depend on them have no interval.
     """
-    factors = _factors_of_effects(robot, effects)
+    # By how much each parameter of the effects changes the physical parameters
+    every = robot.drive.steered
+    changes: dict[tuple[str, str], Mapping[str, float]] = {
+        ("wheel_dead_zone", "c"): {"lost_rate": -1.0},  # c is gained
+        ("steering_gain", "g"): {f"steering_gain_{name}": 1.0 for name in every},
+        ("steering_offset", "c"): {f"steering_zero_{name}": 1.0 for name in every},
+        ("lidar_lever_arm", "x"): {"mount_x": 1.0},
+        ("lidar_lever_arm", "y"): {"mount_y": 1.0},
+        **{("driven_steering_offset", f"c_{name}"): {f"steering_zero_{name}": 1.0} for name in every},
+    }
+    factors = [changes.get((term.name, name), {}) for term in effects for name in term.parameters]
     model = _class_model(robot, fitted_mount, [name for factor in factors for name in factor])
     geometry, size = model.geometry, matrix.size
 
@@ -439,7 +436,8 @@ def _doubt(robot: Robot, parameters: Sequence[PhysicalParameter], fitted_mount: 
         ends = (each.low, each.high) if each.low is not None and each.high is not None else (each.value, each.value)
         nearest = min(max(each.design, ends[0]), ends[1])
         effective = each.name == "track" and robot.skid  # of wheels that slide
-        if each.name.startswith(_LENGTHS) and not effective and abs(nearest / each.design - 1) > _IMPLAUSIBLE:
+        is_length = each.name.startswith(_LENGTHS) and each.design and not effective
+        if is_length and abs(nearest / each.design - 1) > _IMPLAUSIBLE:
             doubted.append(f"{each.name} {each.deviation_percent:+.1f} %")
     if not doubted:
         return ""
@@ -555,17 +553,3 @@ def _class_model(robot: Robot, fitted_mount: bool, of_effects: Collection[str]) 
 def _middle(places: Sequence[float]) -> tuple[float, float]:
     """The middle between the least and the largest place, and the distance between them."""
     return (min(places) + max(places)) / 2, max(places) - min(places)
-
-
-def _factors_of_effects(robot: Robot, effects: Sequence[NamedEffect]) -> list[Mapping[str, float]]:
-    """By how much each parameter of the effects changes the physical parameters of a robot, by their names."""
-    every = robot.drive.steered
-    known = {
-        ("wheel_dead_zone", "c"): {"lost_rate": -1.0},  # c is gained
-        ("steering_gain", "g"): {f"steering_gain_{name}": 1.0 for name in every},
-        ("steering_offset", "c"): {f"steering_zero_{name}": 1.0 for name in every},
-        ("lidar_lever_arm", "x"): {"mount_x": 1.0},
-        ("lidar_lever_arm", "y"): {"mount_y": 1.0},
-        **{("driven_steering_offset", f"c_{name}"): {f"steering_zero_{name}": 1.0} for name in every},
-    }
-    return [known.get((term.name, name), {}) for term in effects for name in term.parameters]

@@ -145,14 +145,12 @@ def _smoothed(twists: Array, samples: RunSamples, share: float) -> Array:
 
     bands = np.array([[1.0], [share - 1.0]]).repeat(len(twists), axis=1)
     bands[1, samples.edges[1:] - 1] = 0.0  # from the last sample of a run to the first of the next
-    smoothed: Array = dtbtrs(bands, share * twists, uplo="L")[0]
-    return smoothed
+    return dtbtrs(bands, share * twists, uplo="L")[0]
 
 
 def steering_rates(ends: Array, middles: Array | None, durations: Array) -> Array:
     """Rates (F, S) of steering angles from those at the samples' ends and in their middles, rad; durations (F,), s."""
-    rates: Array = 2 * (ends - needed(middles)) / durations[:, None]
-    return rates
+    return 2 * (ends - needed(middles)) / durations[:, None]
 
 
 class SteeringGears:
@@ -254,8 +252,7 @@ class SignalStream:
             return None
         before = self.pose
         self.pose = advance(before, moved, "arc")
-        middle: Array = (before + self.pose)[None] / 2
-        return middle
+        return (before + self.pose)[None] / 2
 
     def next(
         self,

@@ -77,7 +77,26 @@ def log_of_arrays(
         steering=None if steering is None else finite_array("steering", steering, 2),
         drive=None if robot.drive.direct else robot.drive,
     )
-    _check(robot, log)
+    # Shapes that agree with each other and the robot, and times that increase
+    steered = robot.drive.steered
+    if steered and log.steering is None:
+        raise DataError(f"steering is missing: angles (F, {len(steered)}) of the wheels {', '.join(steered)}, rad")
+    samples = len(log.times)
+    rows = "a row for each of the times, a column for each of the wheels"
+    of_wheels, of_steered = f"{rows} {', '.join(robot.wheel_names)}", f"{rows} {', '.join(steered)}"
+    for name, array, shape, axes in (
+        ("rates", log.rates, (samples, len(robot.wheel_names)), of_wheels),
+        ("angles", log.wheel_angles, (samples, len(robot.wheel_names)), of_wheels),
+        ("steering", log.steering, (samples, len(steered)), of_steered),
+        ("start", log.start, (3,), "x, y in m and heading in rad"),
+    ):
+        if array is not None and array.shape != shape:
+            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {axes}")
+    for name, values, least in (("times", log.times, np.nextafter(0.0, 1.0)), ("stamps", log.stamps, 0.0)):
+        steps = np.diff(values, prepend=values[0] - 1.0)
+        for row in np.flatnonzero((steps <= 0) | (values < least))[:1]:
+            rule = "> 0" if name == "times" else ">= 0"
+            raise DataError(f"{name}, row {row + 1}: it is {values[row]:g}; times increase and are {rule}")
     return log
 
 
@@ -118,26 +137,3 @@ def logs_of(robot: Robot, wheels: Any, start: ArrayLike | None) -> Iterator[tupl
                 angles=run.select(phases) if set(phases) <= set(table.columns) else None,
             ),
         )
-
-
-def _check(robot: Robot, log: WheelLog) -> None:
-    """DataError: shapes do not agree with each other and the robot, or times do not increase."""
-    steered = robot.drive.steered
-    if steered and log.steering is None:
-        raise DataError(f"steering is missing: angles (F, {len(steered)}) of the wheels {', '.join(steered)}, rad")
-    samples = len(log.times)
-    rows = "a row for each of the times, a column for each of the wheels"
-    of_wheels, of_steered = f"{rows} {', '.join(robot.wheel_names)}", f"{rows} {', '.join(steered)}"
-    for name, array, shape, axes in (
-        ("rates", log.rates, (samples, len(robot.wheel_names)), of_wheels),
-        ("angles", log.wheel_angles, (samples, len(robot.wheel_names)), of_wheels),
-        ("steering", log.steering, (samples, len(steered)), of_steered),
-        ("start", log.start, (3,), "x, y in m and heading in rad"),
-    ):
-        if array is not None and array.shape != shape:
-            raise DataError(f"{name} has shape {array.shape}, expected {shape}: {axes}")
-    for name, values, least in (("times", log.times, np.nextafter(0.0, 1.0)), ("stamps", log.stamps, 0.0)):
-        steps = np.diff(values, prepend=values[0] - 1.0)
-        for row in np.flatnonzero((steps <= 0) | (values < least))[:1]:
-            rule = "> 0" if name == "times" else ">= 0"
-            raise DataError(f"{name}, row {row + 1}: it is {values[row]:g}; times increase and are {rule}")

@@ -12,7 +12,7 @@ from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRIC
 from scipy.special import stdtrit
 
 from omnibench.robot.calibration import EffectTerm
-from omnibench.robot.kinematics import Array, Mount, Robot, published_matrix
+from omnibench.robot.kinematics import Array, Mount, Robot, Wheel, published_matrix
 from omnibench.robot.physical import Geometry, PhysicalParameter, PhysicalReading, physical_tolerance, read_matrix
 
 # Names of the parameters of each class, in the order in which they are shown.
@@ -292,3 +292,10 @@ def test_eq_8_of_the_paper_says_that_its_lengths_can_hardly_be_those_of_wheels()
 def test_a_length_whose_interval_reaches_plausible_ones_is_not_doubted() -> None:
     matrix = published_matrix("palacin2023_eq8")
     assert not read_matrix(APR_02, matrix, scattered(APR_02, 0.05)).doubt
+
+
+def test_a_wheel_in_the_middle_whose_lever_arm_is_0_by_design_is_read_like_any_other() -> None:
+    odometer = Wheel(name="odometer", type="omni", radius=0.03, x=0, y=0, angle=0.0)
+    robot = DIFFERENTIAL.model_copy(update={"wheels": (*DIFFERENTIAL.wheels, odometer)})
+    reading = read_matrix(robot, robot.inverse_kinematic_matrix, scattered(robot))
+    assert (values(reading)["distance_odometer"], reading.doubt) == (pytest.approx(0.0, abs=1e-9), "")

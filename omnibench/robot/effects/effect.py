@@ -281,17 +281,13 @@ def correction_of(effect: MotionEffect, signals: Signals, values: Values) -> Arr
     return correction
 
 
-def accepts_form(effect: MotionEffect, robot: Robot, name: str) -> bool:
-    """True for the name of a value of one of the effect's forms."""
-    first, _, rest = name.partition(":")
-    if first in form_covariates(effect):
-        return rest in ("low", "high", *(f"mean_{power}" for power in _POWERS))
-    if first not in {parameter.name for parameter in _linear(effect, robot)}:
-        return False
-    covariate, _, last = rest.rpartition(":")
-    if covariate == "wheel":
-        return last in _unequal_wheels(effect, robot)
-    return covariate in form_covariates(effect) and last in map(str, _POWERS)
+def form_names(effect: MotionEffect, robot: Robot) -> set[str]:
+    """Names of the values of all forms of the effect."""
+    covariates, linear = form_covariates(effect), [parameter.name for parameter in _linear(effect, robot)]
+    forms = [f"{covariate}:{power}" for covariate in covariates for power in _POWERS]
+    forms += [f"wheel:{wheel}" for wheel in _unequal_wheels(effect, robot)]
+    scales = {f"{covariate}:{key}" for covariate in covariates for key in ("low", "high", "mean_1", "mean_2")}
+    return scales | {f"{name}:{form}" for name in linear for form in forms}
 
 
 def form_in_words(values: Values) -> str:
@@ -430,14 +426,22 @@ def make_term(
     prefix = f"{where}: effect {name!r}" if where else f"effect {name!r}"
     check_applies(effect, robot, prefix)
     listed = {parameter.name: parameter for parameter in effect.parameters(robot, sessions)}
+    forms = set[str]()
+    if isinstance(effect, MotionEffect) and any(":" in key for key in parameters):
+        forms = form_names(effect, robot)
     for key, value in parameters.items():
-        is_form = isinstance(effect, MotionEffect) and accepts_form(effect, robot, key)
-        if key not in listed and not effect.accepts(key) and not is_form:
+        if key not in listed and key not in forms and not effect.accepts(key):
             raise UnknownNameError("parameter", key, listed, prefix)
-        if not _is_number(value) or not math.isfinite(value):
+        number: Any = value
+        if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
             raise DataError(f"{prefix}: parameter {key!r} is {value!r}, not a finite number")
+        # Its range, or that of the parameter whose form it is of, or of a covariate's scale; else of an unknown session
         formed = key.partition(":")[0]
-        low, high = _SCALES if ":" in key and formed not in listed else _limits(listed.get(formed))
+        low, high = _SCALES if ":" in key else (-_FAR_OUTSIDE, _FAR_OUTSIDE)
+        if (parameter := listed.get(formed)) is not None:
+            low, high = parameter.low, parameter.high
+            if not parameter.choices:
+                low, high = -_FAR_OUTSIDE * parameter.largest, _FAR_OUTSIDE * parameter.largest
         if not low <= value <= high:
             raise DataError(f"{prefix}: parameter {key!r} is {value:g}, not within {low:g} and {high:g}")
     for parameter in listed.values():
@@ -458,17 +462,3 @@ def check_applies(effect: Effect, robot: Robot, prefix: str) -> None:
     """DataError, in one line that begins with ``prefix``: the effect does not apply to the robot."""
     if not effect.applies(robot):
         raise DataError(f"{prefix} is for {effect.only_for}; robot {robot.name} is none, leave the effect out")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _limits(parameter: Parameter | None) -> tuple[float, float]:
-    """Lowest and highest allowed value; None: a parameter that is accepted but not listed."""
-    if parameter is None:
-        return -_FAR_OUTSIDE, _FAR_OUTSIDE
-    if parameter.choices:
-        return parameter.low, parameter.high
-    largest = _FAR_OUTSIDE * parameter.largest
-    return -largest, largest

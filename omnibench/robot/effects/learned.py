@@ -51,8 +51,7 @@ class Network:
         active = signals
         for weights, biases, rest in self._prepared:
             active = np.tanh(active @ weights + biases) - rest  # Eq. (1)
-        twists: Array = active @ self._to_twist  # Eq. (2)
-        return twists
+        return active @ self._to_twist  # Eq. (2)
 
     @cached_property
     def _prepared(self) -> list[tuple[Array, Array, Array]]:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, Need, Parameter, ReferenceEffect, Values
-from omnibench.robot.effects.textbook import EachWheelEffect, has_rollers, of_wheels
+from omnibench.robot.effects.effect import Need, Parameter, ReferenceEffect, Values
+from omnibench.robot.effects.textbook import BodyEffect, EachWheelEffect, WheelEffect, has_rollers, of_wheels
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import STILL, Signals, needed
 
@@ -114,8 +114,7 @@ def bump(places: Array, values: Values) -> Array:
 
 def across(places: Array, values: Values) -> Array:
     """Distances (F,) of positions (F, 2) from a line, on the side of its normal positive, m."""
-    distances: Array = places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
-    return distances
+    return places @ [np.cos(values["normal"]), np.sin(values["normal"])] - values["distance"]
 
 
 def beyond(places: Array, values: Values) -> Array:
@@ -147,10 +146,9 @@ ACROSS_A_LINE = PLACE._replace(words="the line")
 MOTION = Covariate("command", "the motion")
 
 
-class SmoothEffect(WithoutCause, MotionEffect):
+class SmoothEffect(WithoutCause, BodyEffect):
     """Changes of the motion that depend on a covariate: for each of ``modes`` a sum of the ``labels`` functions."""
 
-    stage = "body"
     modes: ClassVar[tuple[str, ...]]
     labels: ClassVar[tuple[str, ...]]
 
@@ -327,8 +325,7 @@ def smooth_session_wave(signals: Signals, values: Values) -> Array:
 def smooth_order_of_runs(signals: Signals, values: Values) -> Array:
     """Unknown effect: polynomials of the time since the session's start; after the longest seen the value is held."""
     unit = np.clip(2 * needed(signals.session_time) / values["duration"] - 1, -1.0, 1.0)
-    functions: Array = chebyshev.chebvander(unit, 12)[:, 1:]
-    return functions
+    return chebyshev.chebvander(unit, 12)[:, 1:]
 
 
 def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
@@ -339,8 +336,7 @@ def mean_waves(signals: Signals, wheel: int, harmonic: float) -> Array:
     """
     half = harmonic / 2 * signals.durations
     amplitude = np.sin(half * signals.rates[:, wheel]) / half
-    means: Array = amplitude[:, None] * waves(needed(signals.wheel_angles)[:, wheel], (harmonic,))
-    return means
+    return amplitude[:, None] * waves(needed(signals.wheel_angles)[:, wheel], (harmonic,))
 
 
 def ripple(signals: Signals, harmonic: float, values: Values) -> Array:
@@ -449,10 +445,9 @@ class SmoothWheelRate(WithoutCause, EachWheelEffect):
 
 
 @effects.register("smooth_common_rate")
-class SmoothCommonRate(WithoutCause, MotionEffect):
+class SmoothCommonRate(WithoutCause, WheelEffect):
     """Unknown effect: a finer function of the wheel rate, the same for all wheels, held beyond the rates seen."""
 
-    stage = "wheel"
     shows_in = "wheel rate"
     fixed_parameters = (
         *(
@@ -468,10 +463,9 @@ class SmoothCommonRate(WithoutCause, MotionEffect):
 
 
 @effects.register("smooth_acceleration")
-class SmoothAcceleration(WithoutCause, MotionEffect):
+class SmoothAcceleration(WithoutCause, BodyEffect):
     """Unknown effect: changes that grow with the acceleration, up to the largest that was seen, and then no more."""
 
-    stage = "body"
     shows_in = "acceleration"
     fixed_parameters = (
         Parameter("straight", "s", -0.1, 0.1, "change of the velocity, of the acceleration"),
@@ -534,8 +528,7 @@ class BentMap(WithoutCause, ReferenceEffect):
         """Shift (K, 3) of reported poses relative to the shift of the start, m, m, rad."""
         factors = np.array([[values[f"{axis}_{label}"] for label in self.labels] for axis in _AXES])
         there = self.functions(poses[:, :2], values) - self.functions(start[None, :2], values)
-        shift: Array = there @ factors.T
-        return shift
+        return there @ factors.T
 
 
 def _shifts(labels: Sequence[str]) -> tuple[Parameter, ...]:

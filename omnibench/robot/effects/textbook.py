@@ -45,10 +45,21 @@ def has_rollers(robot: Robot) -> bool:
     return any(wheel.kind in ("omni", "mecanum") for wheel in robot.measured)
 
 
-class EachWheelEffect(MotionEffect):
-    """An effect on the wheel rates, with parameters ``<name>_<wheel>`` of each wheel before the fixed ones."""
+class WheelEffect(MotionEffect):
+    """An effect on the wheel rates."""
 
     stage = "wheel"
+
+
+class BodyEffect(MotionEffect):
+    """An effect on the twist of the robot's centre."""
+
+    stage = "body"
+
+
+class EachWheelEffect(WheelEffect):
+    """An effect on the wheel rates, with parameters ``<name>_<wheel>`` of each wheel before the fixed ones."""
+
     for_each_wheel: ClassVar[tuple[Parameter, ...]]
 
     def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
@@ -66,12 +77,11 @@ def of_wheels(robot: Robot, prefix: str, values: Values) -> Array:
 
 
 @effects.register("speed_dependent_radius")
-class SpeedDependentRadius(MotionEffect):
+class SpeedDependentRadius(WheelEffect):
     """The radius of all wheels changes with their rate: r (1 + k abs(omega))."""
 
-    stage = "wheel"
     physics = "A soft tread grows with the rate of its wheel, or is pressed flatter by what drives it."
-    source = "H. B. Pacejka, Tire and Vehicle Dynamics (effective rolling radius)"
+    source = f"{_PACEJKA} (effective rolling radius)"
     shows_in = "wheel rate"
     fixed_parameters = (Parameter("k", "s/rad", -0.02, 0.02, "relative change of the radius per rad/s"),)
 
@@ -93,10 +103,9 @@ class DirectionDependentRadius(EachWheelEffect):
 
 
 @effects.register("thermal_radius_drift")
-class ThermalRadiusDrift(MotionEffect):
+class ThermalRadiusDrift(WheelEffect):
     """The radius of all wheels drifts in the course of a session: r (1 + k session time)."""
 
-    stage = "wheel"
     physics = "Treads warm up while they roll and expand, or soften and sink in."
     source = "first principles"
     shows_in = "order of runs"
@@ -109,10 +118,9 @@ class ThermalRadiusDrift(MotionEffect):
 
 
 @effects.register("tyre_wear")
-class TyreWear(MotionEffect):
+class TyreWear(WheelEffect):
     """The radius of all wheels differs from session to session: r (1 + radius_session)."""
 
-    stage = "wheel"
     physics = "Treads wear off, or are changed or pumped up, between two sessions."
     source = _BORENSTEIN
     shows_in = "order of runs"
@@ -140,10 +148,9 @@ def _centripetal(twists: Array) -> Array:
 
 
 @effects.register("acceleration_slip")
-class AccelerationSlip(MotionEffect):
+class AccelerationSlip(BodyEffect):
     """The robot falls behind while it accelerates: v - k dv/dt, in the robot's frame."""
 
-    stage = "body"
     physics = "Slip of the wheels grows with the force that accelerates the robot."
     source = f"{_PACEJKA} (longitudinal slip in proportion to the force)"
     shows_in = "acceleration"
@@ -154,10 +161,9 @@ class AccelerationSlip(MotionEffect):
 
 
 @effects.register("centripetal_slip")
-class CentripetalSlip(MotionEffect):
+class CentripetalSlip(BodyEffect):
     """The robot slides across while it turns: v + k w x v."""
 
-    stage = "body"
     physics = "Slip of the wheels grows with the force that keeps the robot on its curve."
     source = f"{_PACEJKA} (side slip in proportion to the force)"
     shows_in = "command"
@@ -171,13 +177,12 @@ class CentripetalSlip(MotionEffect):
 
 
 @effects.register("load_transfer")
-class LoadTransfer(MotionEffect):
+class LoadTransfer(WheelEffect):
     """A wheel that is pressed down has a smaller radius: r (1 - k a.u_i), u_i the direction of the wheel's axle.
 
     a is the whole acceleration of the body, in its own frame: dv/dt + w x v.
     """
 
-    stage = "wheel"
     physics = "Accelerating shifts the robot's weight from wheel to wheel, and a tread gives way under load."
     source = f"{_PACEJKA} (effective rolling radius under load)"
     shows_in = "acceleration"
@@ -191,10 +196,9 @@ class LoadTransfer(MotionEffect):
 
 
 @effects.register("rotation_translation_coupling")
-class RotationTranslationCoupling(MotionEffect):
+class RotationTranslationCoupling(BodyEffect):
     """The robot turns faster or slower the faster it drives: w (1 + k.v)."""
 
-    stage = "body"
     physics = "Rollers that already slide along their axles give way more easily when the robot turns."
     source = "first principles"
     shows_in = "command"
@@ -209,10 +213,9 @@ class RotationTranslationCoupling(MotionEffect):
 
 
 @effects.register("quadratic_rotation_slip")
-class QuadraticRotationSlip(MotionEffect):
+class QuadraticRotationSlip(BodyEffect):
     """The faster the robot turns, the more of it is lost or gained: w - k w abs(w)."""
 
-    stage = "body"
     physics = "The rollers' drag grows with the rate of turn, and the wheels slip against it."
     source = "first principles"
     shows_in = "command"
@@ -225,13 +228,12 @@ class QuadraticRotationSlip(MotionEffect):
 
 
 @effects.register("icr_shift")
-class IcrShift(MotionEffect):
+class IcrShift(BodyEffect):
     """The faster a skid-steered robot turns, the farther ahead it has its centre of rotation: vy - x w abs(w).
 
     What the rate of turn itself loses by wider tracks is quadratic_rotation_slip.
     """
 
-    stage = "body"
     physics = "The floor's friction across the wheels turns with their load, which turning shifts between the axles."
     source = (
         "A. Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, 2007; J. Pentzer, S. Brennan "
@@ -289,10 +291,9 @@ def _smooth_sign(rates: Array) -> Array:
 
 
 @effects.register("wheel_dead_zone")
-class WheelDeadZone(MotionEffect):
+class WheelDeadZone(WheelEffect):
     """Every wheel that turns loses or gains a constant rate: omega + c sign(omega)."""
 
-    stage = "wheel"
     physics = "Play in the drive and dry friction of the rollers take a constant rate off every wheel that turns."
     source = "H. Olsson et al., Friction models and friction compensation, 1998"
     shows_in = "wheel rate"
@@ -303,10 +304,9 @@ class WheelDeadZone(MotionEffect):
 
 
 @effects.register("coulomb_creep")
-class CoulombCreep(MotionEffect):
+class CoulombCreep(WheelEffect):
     """Every wheel that turns loses a rate in proportion to the robot's speed: omega + c sign(omega) abs(v) / r."""
 
-    stage = "wheel"
     physics = "Rollers drag with a friction that does not depend on their speed, and the wheels creep against it."
     source = "F. W. Carter, On the action of a locomotive driving wheel, 1926; H. Olsson et al., 1998 (friction)"
     shows_in = "wheel rate"
@@ -319,12 +319,6 @@ class CoulombCreep(MotionEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return values["c"] * _smooth_sign(signals.rates) * (signals.speed[:, None] / signals.robot.radii)
-
-
-def _about_the_start(poses: Array, start: Array, factor: complex) -> Array:
-    """Poses (K, 3) whose positions are turned and stretched about the start by a complex factor."""
-    path = ((poses[:, 0] - start[0]) + 1j * (poses[:, 1] - start[1])) * factor
-    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2]])
 
 
 @effects.register("lidar_lever_arm")
@@ -341,16 +335,17 @@ class LidarLeverArm(ReferenceEffect):
     )
 
     def reported(self, poses: Array, start: Array, values: Values) -> Array:
-        return _by_arm(poses, start, complex(values["x"], values["y"]))
+        shift = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * complex(values["x"], values["y"])
+        return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
 
     def corrected(self, poses: Array, start: Array, values: Values) -> Array:
-        return _by_arm(poses, start, -complex(values["x"], values["y"]))
+        return self.reported(poses, start, {name: -value for name, value in values.items()})
 
 
-def _by_arm(poses: Array, start: Array, arm: complex) -> Array:
-    """Poses (K, 3) displaced by the rotation of a lever arm x + iy, m, since the start."""
-    shift = (np.exp(1j * poses[:, 2]) - np.exp(1j * start[2])) * arm
-    return np.column_stack([poses[:, 0] + shift.real, poses[:, 1] + shift.imag, poses[:, 2]])
+def _about_the_start(poses: Array, start: Array, factor: complex) -> Array:
+    """Poses (K, 3) whose positions are turned and stretched about the start by a complex factor."""
+    path = ((poses[:, 0] - start[0]) + 1j * (poses[:, 1] - start[1])) * factor
+    return np.column_stack([start[0] + path.real, start[1] + path.imag, poses[:, 2]])
 
 
 @effects.register("lidar_yaw")
@@ -367,7 +362,7 @@ class LidarYaw(ReferenceEffect):
         return _about_the_start(poses, start, complex(np.exp(1j * values["beta"])))
 
     def corrected(self, poses: Array, start: Array, values: Values) -> Array:
-        return _about_the_start(poses, start, complex(np.exp(-1j * values["beta"])))
+        return self.reported(poses, start, {"beta": -values["beta"]})
 
 
 @effects.register("reference_scale")
@@ -468,15 +463,13 @@ class DrivenSteeringOffset(MotionEffect):
 
 def _driving(rates: Array) -> NDArray[np.bool_]:
     """True for samples (F,) in which a wheel turns."""
-    driving: NDArray[np.bool_] = np.abs(rates).max(axis=1) > STILL
-    return driving
+    return np.abs(rates).max(axis=1) > STILL
 
 
 @effects.register("heading_drift")
-class HeadingDrift(MotionEffect):
+class HeadingDrift(BodyEffect):
     """The robot turns a little all the time while it drives: w + b."""
 
-    stage = "body"
     physics = "Something pulls to one side whatever the command: a dragged cable, a bent wheel, a drifting reference."
     source = "first principles"
     shows_in = "elapsed time"
@@ -487,10 +480,9 @@ class HeadingDrift(MotionEffect):
 
 
 @effects.register("body_velocity_bias")
-class BodyVelocityBias(MotionEffect):
+class BodyVelocityBias(BodyEffect):
     """The robot moves a little in its own frame all the time while it drives: v + b."""
 
-    stage = "body"
     physics = "Something pulls the robot the same way whatever the command: a dragged cable, rollers that shake it on."
     source = "first principles"
     shows_in = "elapsed time"
@@ -504,10 +496,9 @@ class BodyVelocityBias(MotionEffect):
 
 
 @effects.register("start_transient")
-class StartTransient(MotionEffect):
+class StartTransient(BodyEffect):
     """The robot falls behind at the start of a run: v (1 - k exp(-s / length)), s the way since it stood."""
 
-    stage = "body"
     physics = "Play has to be taken up and rollers have to align themselves before the wheels drive the robot in full."
     source = "first principles"
     shows_in = "elapsed time"
@@ -525,19 +516,15 @@ class StartTransient(MotionEffect):
 
 
 @effects.register("caster_pull")
-class CasterPull(MotionEffect):
+class CasterPull(BodyEffect):
     """A caster that swings round takes the robot along: w + k times the rate of its swing.
 
     The caster stands as far behind the centre as the wheels beside it, and has a trail of 5 cm (signals.py). The side
     to which it swings is that of the turn; where the robot goes straight back, it is chance, and nothing is added.
     """
 
-    stage = "body"
     physics = "Friction in a caster's swivel, and of its tread on the floor, turns the robot while the caster swings."
-    source = (
-        "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996 "
-        "(internal forces by castor wheels)"
-    )
+    source = f"{_BORENSTEIN} (internal forces by castor wheels)"
     shows_in = "command"
     needs = frozenset({"caster_rates"})
     only_for = "differential drives, which casters hold up"
@@ -683,10 +670,9 @@ class SteeringOffset(_SteeringEffect):
 
 
 @effects.register("steering_coupling")
-class SteeringCoupling(MotionEffect):
+class SteeringCoupling(WheelEffect):
     """Turning a module about its steering axis turns its drive encoder as well: omega + k d(phi)/dt."""
 
-    stage = "wheel"
     physics = "The motor drives the wheel by a gear that runs round the steering axis, and rolls on it when it steers."
     source = "CTRE Phoenix 6, SwerveModuleConstants.CouplingGearRatio"
     shows_in = "steering angle"

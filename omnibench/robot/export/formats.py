@@ -15,16 +15,20 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from omnibench.errors import ConfigError, UnknownNameError, one_line, require_type
-from omnibench.robot.calibration import Calibration, Noise
+from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.textbook import KNEE
 from omnibench.robot.export import ros2_controllers
-from omnibench.robot.export.ros2_controllers import Parameter, RemainingError, interval_in_words, to_node
-from omnibench.robot.kinematics import CarDrive, Mount
+from omnibench.robot.export.ros2_controllers import Controller, RemainingError, interval_in_words
+from omnibench.robot.kinematics import Mount
 from omnibench.views import Brief
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 # m2/s and rad2/s, then as often per s2 and s4: x, y, z, roll, pitch, yaw, their velocities, accelerations. The
 # package's defaults (params/ekf.yaml), but for x, y and yaw.
@@ -42,33 +46,63 @@ class Export(Brief):
     file_name: str
 
 
+def _environment() -> Environment:
+    """The templates of the exported files, which stand beside this module."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # slow to import
+
+    templates = Environment(
+        loader=PackageLoader(__package__, "."),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= {
+        "literal": _c_literal,
+        "strings": lambda names: ", ".join(f'"{name}"' for name in names),
+        "in_comment": lambda text: " ".join(text.split()).replace("*/", "* /"),
+        "quoted": lambda name: repr(one_line(name)),
+        "number": lambda value: f"{round(value, 12) + 0.0:.12f}",  # no -0
+        "exponent": lambda value: f"{value:.6e}",
+        "listed": lambda names: f"[{', '.join(names)}]",
+    }
+    return templates
+
+
+def _nodes(calibration: Calibration, fitted: Controller | None, base: Mount, **content: Any) -> str:
+    """Parameters of nodes, made of the template node_parameters.yaml.j2. fitted: the controller, None if none holds it.
+
+    content: what the template needs beside the controller and its covariances.
+    """
+    pose = ros2_controllers.pose_variances(calibration, base)
+    template = _environment().get_template("node_parameters.yaml.j2")
+    return template.render(
+        calibration=calibration,
+        controller=fitted,
+        pose_variances=pose,
+        twist_variances=None if pose is None else pose / calibration.sample_period,
+        interval=interval_in_words(calibration),
+        **content,
+    )
+
+
 def _ros2_controllers(calibration: Calibration) -> Export:
     """The controller's parameters as YAML with comments. ConfigError: no controller can describe this robot."""
     fitted = ros2_controllers.controller(calibration.robot, calibration.matrix_without_effects)
     design = ros2_controllers.controller(calibration.robot, calibration.robot.inverse_kinematic_matrix)
     warnings = ros2_controllers.warnings_of(calibration, fitted, design)
-    values = [
-        f"{parameter.name} {ros2_controllers.number(parameter.value, 6)}"
-        for parameter in design.parameters
-        if isinstance(parameter.value, float)
-    ]
-    head = _comments(
-        calibration, f"{fitted.name} (ros2_controllers)", "closest to", warnings, f"Design values: {', '.join(values)}"
+    numbers = {name: value for name, value in design.values.items() if isinstance(value, float)}
+    text = _nodes(
+        calibration,
+        fitted,
+        fitted.base,
+        what=f"{fitted.name} (ros2_controllers)",
+        relation="closest to",
+        warnings=warnings,
+        last=f"Design values: {', '.join(f'{name} {round(value, 6) + 0.0:.6f}' for name, value in numbers.items())}",
     )
-    parameters = (*fitted.parameters, *ros2_controllers.covariance_parameters(calibration, fitted))
     stem = f"{_stem(calibration.name)}_{fitted.name.removesuffix('_controller')}"
-    return Export(head + to_node(fitted.name, parameters), warnings, f"{stem}.yaml")
-
-
-def _comments(calibration: Calibration, what: str, relation: str, warnings: tuple[str, ...], last: str) -> str:
-    """The comment above parameters: what they are of, the warnings, and a last line."""
-    lines = [
-        f"{what} for robot {one_line(calibration.robot.name)!r},",
-        f"{relation} the omnibench calibration {one_line(calibration.name)!r} of {calibration.created:%Y-%m-%d}.",
-        *(f"- {warning}" for warning in warnings),
-        last,
-    ]
-    return "".join(f"# {line}\n" for line in lines)
+    return Export(text, warnings, f"{stem}.yaml")
 
 
 def robot_localization(calibration: Calibration) -> Export:
@@ -87,40 +121,6 @@ def robot_localization(calibration: Calibration) -> Export:
             f"robot_localization: calibration {calibration.name!r} has no noise model, of which covariances are made; "
             "calibrate once more with closed_form, which estimates it"
         )
-    warnings = _warnings(calibration, noise, base)
-    along_x, along_y, heading = np.sqrt(growth).tolist()
-    head = _comments(
-        calibration,
-        "robot_localization",
-        "from",
-        warnings,
-        f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
-        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
-    )
-    process_noise = ",\n      ".join(", ".join(map(str, row)) for row in np.diag(_PROCESS_NOISE).tolist())
-    node = (
-        Parameter("two_d_mode", "true"),
-        Parameter("odom0", "/odom" if publisher is None else f"/{publisher.name}/{publisher.topic}"),
-        Parameter(
-            "odom0_config",
-            tuple("true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE))),
-            "vx, vy, vyaw: velocities only",
-        ),
-        Parameter("odom0_differential", "false"),
-        Parameter("process_noise_covariance", f"[{process_noise}]"),
-    )
-    if publisher is not None:
-        covariances = to_node(publisher.name, ros2_controllers.covariance_parameters(calibration, publisher))
-    else:
-        along_x, along_y, turning = (f"{value:.6e}" for value in (growth / calibration.sample_period).tolist())
-        covariances = (
-            f"# twist.covariance of the messages: [0] {along_x}, [7] {along_y} m2/s2, [35] {turning} rad2/s2\n"
-        )
-    file_name = f"{_stem(calibration.name)}_robot_localization.yaml"
-    return Export(head + to_node("ekf_filter_node", node) + covariances, warnings, file_name)
-
-
-def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str, ...]:
     interval = interval_in_words(calibration)
     warnings = [
         f"twist variances are of messages every {interval}; for another interval T multiply them by {interval} / T",
@@ -135,52 +135,48 @@ def _warnings(calibration: Calibration, noise: Noise, base: Mount) -> tuple[str,
     deviations = ros2_controllers.matrix_deviations(calibration, base)
     if deviations is None:
         warnings.append("the calibration has no covariance of its matrix: how far that may be off is not known")
-        return tuple(warnings)
-    # Standard deviations in the worst direction of straight driving and on the spot.
-    positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
-    headings = deviations[:, 2].tolist()
-    sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
-    warnings.append(
-        f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
-        "message stands for it, and is left out"
+    else:
+        # Standard deviations in the worst direction of straight driving and on the spot.
+        positions = np.hypot(deviations[:, 0], deviations[:, 1]).tolist()
+        headings = deviations[:, 2].tolist()
+        sigma = RemainingError(max(positions[:-1]), max(headings[:-1]), positions[-1], headings[-1])
+        warnings.append(
+            f"the matrix may be off by {sigma} (1 sigma); that is the same in every message, so that no variance of a "
+            "message stands for it, and is left out"
+        )
+        if calibration.provenance is not None and calibration.provenance.on_bounds:
+            names = ", ".join(calibration.provenance.on_bounds)
+            warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
+    along_x, along_y, heading = np.sqrt(growth).tolist()
+    text = _nodes(
+        calibration,
+        publisher,
+        base,
+        what="robot_localization",
+        relation="from",
+        warnings=warnings,
+        last=f"Random walk of the odometry: {1e3 * along_x:.3g} mm in x, {1e3 * along_y:.3g} mm in y, "
+        f"{np.degrees(heading):.3g} deg per root second; the filter's pose grows by that.",
+        fused=["true" if index in _FUSED else "false" for index in range(len(_PROCESS_NOISE))],
+        process_noise=np.diag(_PROCESS_NOISE).tolist(),
     )
-    if calibration.provenance is not None and calibration.provenance.on_bounds:
-        names = ", ".join(calibration.provenance.on_bounds)
-        warnings.append(f"of {names}, on a bound of the box, no variance is known and none is counted")
-    return tuple(warnings)
+    return Export(text, tuple(warnings), f"{_stem(calibration.name)}_robot_localization.yaml")
 
 
 def _c_header(calibration: Calibration) -> Export:
     """A self-contained C99 header: the matrix and one step of the odometry, made of the template odometry.h.j2."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # slow to import
-
     robot, prefix = calibration.robot, _stem(calibration.name)
-    templates = Environment(
-        loader=PackageLoader(__package__, "."),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    templates.filters |= {
-        "literal": _c_literal,
-        "quoted": lambda names: ", ".join(f'"{name}"' for name in names),
-        "in_comment": lambda text: " ".join(text.split()).replace("*/", "* /"),
-    }
     plain = _header_is_plain(calibration)
     held = {
         name: 0 if plain else sum(term.parameters[parameter] for term in calibration.effects if term.name == name)
         for name, parameter in _IN_HEADER.items()
     }
-    text = templates.get_template("odometry.h.j2").render(
+    template = _environment().get_template("odometry.h.j2")
+    text = template.render(
         calibration=calibration,
         left_out=left_out(calibration),
         prefix=prefix,
-        upper=prefix.upper(),
-        drive=robot.drive,
-        ahead=float(np.mean(robot.drive.ahead, axis=0)[0]) if isinstance(robot.drive, CarDrive) else None,
         matrix=(calibration.matrix_without_effects if plain else calibration.matrix_array).tolist(),
-        counter_clockwise=all(wheel.lever > 0 for wheel in robot.measured),
         lost=held["wheel_dead_zone"],
         knee=KNEE,
         gain=1 + held["steering_gain"],

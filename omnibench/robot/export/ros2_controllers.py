@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from omnibench.robot.paths import legs_of, usual_paths, wheel_log
 _STEPS = {"arc": "arcs", "euler": "Euler steps"}
 _WRONG_WAY = "ros2_controllers: the matrix does not drive this robot ahead and turn it counter-clockwise; check "
 _NO_TURN = "ros2_controllers: the matrix does not turn this robot counter-clockwise; check wheel signs"
+_PLACE = "x {:.4f} m, y {:.4f} m of the robot's centre"
 _TAKES_END = "the controller takes the steering angle at a sample's end, the calibration in its middle"
 
 # All chosen.
@@ -39,28 +41,19 @@ _CORNERS = {
 }
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of a ROS 2 node: its name, with dots where it is nested, its value, and what stands behind it."""
-
-    name: str
-    value: float | str | tuple[str, ...]
-    comment: str = ""
-
-
 @dataclass(frozen=True, eq=False)
 class Controller:
     """A controller whose parameters come closest to a matrix.
 
-    matrix (3, M): the inverse kinematic matrix by which it computes the twist of its base frame. base: that frame in
-    the robot's. holds: what stands for the matrix, in words, and lost: what that costs. joints: parameters that name
-    joints, in words. notes: what else to do or to know. integration: how it integrates a twist. covariances: their
-    parameters' names. topic: of its odometry. lever: True if what is left where the robot turns on the
-    spot is the lever arm of a frame that is not at its base.
+    values: of the parameters, by their names, numbers and names of joints. matrix (3, M): the inverse kinematic matrix
+    by which it computes the twist of its base frame. base: that frame in the robot's. holds: what stands for the
+    matrix, in words, and lost: what that costs. joints: parameters that name joints, in words. notes: what else to do
+    or to know. integration: how it integrates a twist. topic: of its odometry. lever: True if what is left where the
+    robot turns on the spot is the lever arm of a frame that is not at its base.
     """
 
     name: str
-    parameters: tuple[Parameter, ...]
+    values: Mapping[str, float | str | Sequence[str]]
     matrix: Array
     holds: str
     joints: str
@@ -68,7 +61,6 @@ class Controller:
     notes: tuple[str, ...] = ()
     base: Mount = field(default_factory=Mount)
     integration: str = "arcs"
-    covariances: str = "{}_covariance_diagonal"
     topic: str = "odom"
     lever: bool = True
 
@@ -119,86 +111,37 @@ def warnings_of(calibration: Calibration, fitted: Controller, design: Controller
     if integrated != fitted.integration:
         warnings.append(f"the matrix was calibrated for {integrated}, the controller integrates {fitted.integration}")
     if calibration.effects:
-        warnings.append(_effects_left_out(calibration))
+        # By how much a live node's odometry, which has the effects, differs
+        whole = calibration.model
+        plain = replace(whole, matrix=calibration.matrix_without_effects, terms=(), fade=None)
+        differences, words = [], {"straight 1.0": "a metre ahead", "turn 360": "a turn"}
+        for path in usual_paths(robot)[:-1]:  # the square has no motion that is new
+            log = wheel_log(calibration, legs_of(path, robot))
+            x, y, heading = (whole.poses([log])[0][-1] - plain.poses([log])[0][-1]).tolist()
+            way, turn = 1e3 * math.hypot(x, y), math.degrees(abs(heading))
+            differences.append(f"{way:.1f} mm and {turn:.2f} deg {words.get(path, path)}")
+        fitted_with = "without" if calibration.plain is not None else "with"
+        warnings.append(
+            f"effects are left out, the matrix was fitted {fitted_with} them: {calibration.effects_in_words}; a live "
+            f"node, which has them, differs by {', '.join(differences)}"
+        )
     # Frames that are not the robot's centre, and a base frame that would leave less.
     if robot.mount is not None:
         warnings.append("the calibration is of the tracked point, the parameters are of the robot's centre (mount)")
     if max(abs(base.x), abs(base.y)) > _NEGLIGIBLE:
         warnings.append(
-            f"base_frame_id has to be a frame at {_place(base.x, base.y)}, in the middle of the wheels that do not "
-            "steer"
+            f"base_frame_id has to be a frame at {_PLACE.format(base.x, base.y)}, in the middle of the wheels that do "
+            "not steer"
         )
     to_right, ahead, _ = remaining_errors(robot, fitted.matrix, true, base)[:, -1].tolist()
     if fitted.lever and max(abs(ahead), abs(to_right)) > _NEGLIGIBLE:
-        place = _place(base.x + ahead, base.y - to_right)
+        place = _PLACE.format(base.x + ahead, base.y - to_right)
         warnings.append(f"the millimetres a full turn are a lever arm: a base_frame_id at {place} would leave none")
     if robot.skid:
         warnings.append("the robot skids: the parameters are those of the floor, the load and the speeds driven")
     if calibration.noise is None:
         warnings.append("covariances are left at the controller's defaults: the calibration has no noise model")
     return tuple(warnings)
-
-
-def _effects_left_out(calibration: Calibration) -> str:
-    """The effects that the controller does not hold, and by how much a live node's odometry differs for them."""
-    robot, whole = calibration.robot, calibration.model
-    matrix = replace(whole, matrix=calibration.matrix_without_effects, terms=(), fade=None)
-    parts, words = [], {"straight 1.0": "a metre ahead", "turn 360": "a turn"}
-    for path in usual_paths(robot)[:-1]:  # the square has no motion that is new
-        log = wheel_log(calibration, legs_of(path, robot))
-        x, y, heading = (whole.poses([log])[0][-1] - matrix.poses([log])[0][-1]).tolist()
-        parts.append(
-            f"{1e3 * math.hypot(x, y):.1f} mm and {math.degrees(abs(heading)):.2f} deg {words.get(path, path)}"
-        )
-    fitted = "out" if calibration.plain is not None else ""
-    return (
-        f"effects are left out, the matrix was fitted with{fitted} them: {calibration.effects_in_words}; a live node, "
-        f"which has them, differs by {', '.join(parts)}"
-    )
-
-
-def _place(x: float, y: float) -> str:
-    return f"x {x:.4f} m, y {y:.4f} m of the robot's centre"
-
-
-def covariance_parameters(calibration: Calibration, controller: Controller) -> tuple[Parameter, ...]:
-    """The controller's covariances by the calibration's noise; empty without a noise model."""
-    pose = pose_variances(calibration, controller.base)
-    if pose is None:
-        return ()
-    per_message = f"m2/s2, rad2/s2: of messages every {interval_in_words(calibration)}"
-    parameters = []
-    for quantity, variances, comment in (
-        ("pose", pose, "m2, rad2: what 1 s adds"),
-        ("twist", pose / calibration.sample_period, per_message),
-    ):
-        x, y, heading = (f"{value:.6e}" for value in variances.tolist())
-        diagonal = (x, y, "0.0", "0.0", "0.0", heading)
-        parameters.append(Parameter(controller.covariances.format(quantity), diagonal, comment))
-    return tuple(parameters)
-
-
-def to_node(name: str, parameters: tuple[Parameter, ...]) -> str:
-    """Parameters of a node as YAML."""
-    lines, opened = [f"{name}:", "  ros__parameters:"], list[str]()
-    for parameter in parameters:
-        *path, key = parameter.name.split(".")
-        shared = next((at for at, (a, b) in enumerate(zip(path, opened, strict=False)) if a != b), len(opened))
-        lines.extend(f"{'  ' * (depth + 2)}{path[depth]}:" for depth in range(min(shared, len(path)), len(path)))
-        opened = path
-        value = parameter.value
-        if isinstance(value, float):
-            value = number(value, 12)
-        elif isinstance(value, tuple):
-            value = f"[{', '.join(value)}]"
-        comment = f"  # {parameter.comment}" if parameter.comment else ""
-        lines.append(f"{'  ' * (len(path) + 2)}{key}: {value}{comment}")
-    return "\n".join(lines) + "\n"
-
-
-def number(value: float, decimals: int) -> str:
-    """A number with so many decimals."""
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0
 
 
 def interval_in_words(calibration: Calibration) -> str:
@@ -230,8 +173,7 @@ def remaining_errors(robot: Robot, used: Array, true: Array, base: Mount | None 
     base: the frame of the robot that both matrices are of; default: its centre.
     """
     motions, signals = driven_motions(robot, base)
-    errors: Array = (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
-    return errors
+    return (used - true) @ signals @ np.linalg.inv(np.linalg.pinv(motions.T) @ true @ signals)
 
 
 def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
@@ -242,8 +184,7 @@ def as_read(robot: Robot, matrix: Array, reading: Array) -> Array:
         K U (A U)^-1.                                                                                  (2)
     """
     _, signals = driven_motions(robot)
-    seen: Array = matrix @ signals @ np.linalg.inv(reading @ signals)
-    return seen
+    return matrix @ signals @ np.linalg.inv(reading @ signals)
 
 
 def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Array]:
@@ -263,8 +204,7 @@ def driven_motions(robot: Robot, base: Mount | None = None) -> tuple[Array, Arra
 
 def of_centre(robot: Robot, matrix: Array) -> Array:
     """The matrix (3, M) of a robot's centre from that of its tracked point."""
-    centre: Array = matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
-    return centre
+    return matrix if robot.mount is None else np.linalg.solve(robot.mount.twist, matrix)
 
 
 def pose_variances(calibration: Calibration, base: Mount) -> Array | None:
@@ -293,15 +233,13 @@ def matrix_deviations(calibration: Calibration, base: Mount) -> Array | None:
     blocks = np.array(calibration.covariance)[: 3 * count, : 3 * count].reshape(3, count, 3, count)
     _, signals = driven_motions(calibration.robot, base)
     variances = np.einsum("ai,aj,imjn,md,nd->da", frame, frame, blocks, signals, signals, optimize=True)
-    deviations: Array = np.sqrt(np.maximum(variances, 0.0))
-    return deviations
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def _from_tracked(calibration: Calibration, base: Mount) -> Array:
     """F (3, 3): the twist of a frame of the robot from that of the tracked point."""
     mount = calibration.robot.mount
-    frame: Array = base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
-    return frame
+    return base.twist if mount is None else base.twist @ np.linalg.inv(mount.twist)
 
 
 def joint_name(wheel: str) -> str:
@@ -331,14 +269,27 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
     and R_r = B k_3r hold distances and headings of rows 1 and 3 exactly, for a frame in the middle between these
     points. What is left is its lever arm, which displaces the robot where it turns and does not add up.
     """
-    sides = _sides(robot)
-    forward = [math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured]
-    reading = np.zeros((2, len(robot.measured)))
-    for row, side in enumerate(sides):
-        for index in side:
-            reading[row, index] = forward[index] / len(side)
+    # The fixed wheels on the left and on the right of their middle
+    fixed = np.array([index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"])
+    askew = [robot.wheel_names[index] for index in fixed if abs(math.cos(robot.measured[index].rolling)) < _ALONG]
+    if askew:
+        raise ConfigError(
+            f"ros2_controllers: diff_drive_controller needs wheels that roll along x, and {', '.join(askew)} do not; "
+            "turn the robot's frame, or use c_header"
+        )
     places = np.array([wheel.position for wheel in robot.measured])
-    middles = np.array([places[side].mean(axis=0) for side in sides])
+    across = places[fixed, 1]
+    on_left = across > (across.max() + across.min()) / 2
+    left, right = fixed[on_left], fixed[~on_left]
+    if not len(left) or len(left) != len(right):
+        raise ConfigError(
+            "ros2_controllers: diff_drive_controller needs as many measured wheels on the left as on the right, found "
+            f"{len(left)} and {len(right)}; use c_header"
+        )
+    forward = np.array([math.copysign(1.0, math.cos(wheel.rolling)) for wheel in robot.measured])
+    reading = np.zeros((2, len(robot.measured)))
+    reading[0, left], reading[1, right] = forward[left] / len(left), forward[right] / len(right)
+    middles = np.array([places[left].mean(axis=0), places[right].mean(axis=0)])
     base, apart = Mount(x=middles[:, 0].mean(), y=middles[:, 1].mean()), float(middles[0, 1] - middles[1, 1])
     ahead, _, turning = base.twist @ as_read(robot, matrix, reading)
     separation = float(np.diff(ahead / turning)[0]) if turning[0] < 0 < turning[1] else 0.0
@@ -346,49 +297,27 @@ def diff_drive(robot: Robot, matrix: Array) -> Controller:
         raise ConfigError(f"{_WRONG_WAY}wheel signs and which wheels are on the left")
     radii = separation * turning * (-1, 1)
     by_side = np.array([[radii[0] / 2, radii[1] / 2], [0.0, 0.0], [-radii[0] / separation, radii[1] / separation]])
-    radius = float(robot.radii[[*sides[0], *sides[1]]].mean())
-    left, right = ([robot.wheel_names[index] for index in side] for side in sides)
-    backwards = [name for name, sign in zip(robot.wheel_names, forward, strict=True) if sign < 0]
-    unread = [name for name in robot.wheel_names if name not in left + right]
+    read = [*left, *right]
+    radius = float(robot.radii[read].mean())
+    backwards = [name for index, name in enumerate(robot.wheel_names) if index in read and forward[index] < 0]
+    unread = [name for index, name in enumerate(robot.wheel_names) if index not in read]
     return Controller(
         "diff_drive_controller",
-        (
-            Parameter("left_wheel_names", tuple(map(joint_name, left))),
-            Parameter("right_wheel_names", tuple(map(joint_name, right))),
-            Parameter("wheel_separation", apart, "m, as designed"),
-            Parameter("wheel_radius", radius, "m, as designed"),
-            Parameter("wheel_separation_multiplier", separation / apart),
-            Parameter("left_wheel_radius_multiplier", float(radii[0] / radius)),
-            Parameter("right_wheel_radius_multiplier", float(radii[1] / radius)),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "left_wheel_names": [joint_name(robot.wheel_names[index]) for index in left],
+            "right_wheel_names": [joint_name(robot.wheel_names[index]) for index in right],
+            "wheel_separation": apart,
+            "wheel_radius": radius,
+            "wheel_separation_multiplier": separation / apart,
+            "left_wheel_radius_multiplier": float(radii[0] / radius),
+            "right_wheel_radius_multiplier": float(radii[1] / radius),
+        },
         by_side @ reading,
         "two wheel radii and one separation",
         "left_wheel_names and right_wheel_names",
-        notes=joint_notes([name for name in backwards if name not in unread], unread),
+        notes=joint_notes(backwards, unread),
         base=base,
     )
-
-
-def _sides(robot: Robot) -> tuple[list[int], list[int]]:
-    """Indices of the fixed wheels on the left and on the right of their middle."""
-    fixed = [index for index, wheel in enumerate(robot.measured) if wheel.kind == "fixed"]
-    askew = [robot.wheel_names[index] for index in fixed if abs(math.cos(robot.measured[index].rolling)) < _ALONG]
-    if askew:
-        raise ConfigError(
-            f"ros2_controllers: diff_drive_controller needs wheels that roll along x, and {', '.join(askew)} do not; "
-            "turn the robot's frame, or use c_header"
-        )
-    across = np.array([robot.measured[index].position[1] for index in fixed])
-    middle = (across.max() + across.min()) / 2
-    left = [index for index, y in zip(fixed, across, strict=True) if y > middle]
-    right = [index for index in fixed if index not in left]
-    if not left or len(left) != len(right):
-        raise ConfigError(
-            "ros2_controllers: diff_drive_controller needs as many measured wheels on the left as on the right, found "
-            f"{len(left)} and {len(right)}; use c_header"
-        )
-    return left, right
 
 
 def car(robot: Robot, drive: CarDrive, matrix: Array) -> Controller:
@@ -431,21 +360,16 @@ def car(robot: Robot, drive: CarDrive, matrix: Array) -> Controller:
         raise ConfigError(f"{_WRONG_WAY}the signs of the wheels and of the steering angles")
     wheelbase = radius / turn
     share = wheelbase / abs(ahead)
-    widths = [("traction_track_width", float(np.ptp(across))), ("steering_track_width", float(np.ptp(beside)))]
+    widths = {"traction_track_width": float(np.ptp(across)), "steering_track_width": float(np.ptp(beside))}
     return Controller(
         name,
-        (
-            Parameter("traction_joints_names", tuple(map(joint_name, rear)), "right, left" if len(rear) > 1 else ""),
-            Parameter(
-                "steering_joints_names",
-                tuple(f"steering_{wheel}_joint" for wheel in front),
-                "right, left" if len(front) > 1 else "",
-            ),
-            Parameter("wheelbase", wheelbase, "m"),
-            *(Parameter(key, width * share, "m") for key, width in widths if width),
-            Parameter("traction_wheel_radius" if len(rear) == 1 else "traction_wheels_radius", radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "traction_joints_names": [joint_name(wheel) for wheel in rear],
+            "steering_joints_names": [f"steering_{wheel}_joint" for wheel in front],
+            "wheelbase": wheelbase,
+            **{name: width * share for name, width in widths.items() if width},
+            "traction_wheel_radius" if len(rear) == 1 else "traction_wheels_radius": radius,
+        },
         np.diag([radius, 0.0, turn])[:, [0, 2]] @ reading,
         "one wheel radius and one wheelbase",
         "traction_joints_names and steering_joints_names",
@@ -473,7 +397,19 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
     i e^(-i theta) (x + iy) r / k, and row 3 is (0, 0, r / k): so the closest parameters in the sum of squares are found
     in closed form.
     """
-    wheels, signs = _corners(robot)
+    # The wheel in each corner of the controller, and the sign (N,) of each wheel's rate driving forward
+    equations = robot.signal_equations
+    signs, found = np.sign(equations[:, 0]), dict[str, int]()
+    for index, (sign, row) in enumerate(zip(signs, equations, strict=True)):
+        corner = next((name for name, pattern in _CORNERS.items() if (sign * np.sign(row) == pattern).all()), None)
+        if corner is not None and robot.measured[index].kind == "mecanum":
+            found[corner] = index
+    if len(found) < 4 or len(robot.measured) > 4:
+        raise ConfigError(
+            "ros2_controllers: mecanum_drive_controller needs one mecanum wheel in each corner, with rollers that form "
+            f"an X or an O seen from above; {', '.join(robot.wheel_names)} do not; check roller angles, or use c_header"
+        )
+    wheels = {corner: found[corner] for corner in _CORNERS}
     reading = np.zeros((3, len(robot.measured)))
     for corner, index in wheels.items():
         reading[:, index] = signs[index] * np.array(_CORNERS[corner]) / 4
@@ -497,17 +433,14 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
         notes += (f"the rollers form an O seen from above, so that {', '.join(elsewhere)}",)
     return Controller(
         "mecanum_drive_controller",
-        (
-            *(
-                Parameter(f"{corner}_wheel_command_joint_name", joint_name(robot.wheel_names[index]))
-                for corner, index in wheels.items()
-            ),
-            Parameter("kinematics.base_frame_offset.x", offset.real, "m"),
-            Parameter("kinematics.base_frame_offset.y", offset.imag, "m"),
-            Parameter("kinematics.base_frame_offset.theta", theta, "rad"),
-            Parameter("kinematics.wheels_radius", radius, "m"),
-            Parameter("kinematics.sum_of_robot_center_projection_on_X_Y_axis", radius / turn, "m"),
-        ),
+        {
+            **{corner: joint_name(robot.wheel_names[index]) for corner, index in wheels.items()},
+            "kinematics.base_frame_offset.x": offset.real,
+            "kinematics.base_frame_offset.y": offset.imag,
+            "kinematics.base_frame_offset.theta": theta,
+            "kinematics.wheels_radius": radius,
+            "kinematics.sum_of_robot_center_projection_on_X_Y_axis": radius / turn,
+        },
         twist @ np.diag([radius, radius, turn]) @ reading,
         "one wheel radius, one sum of distances and one pose of the base frame",
         "joint names",
@@ -517,56 +450,30 @@ def mecanum_drive(robot: Robot, matrix: Array) -> Controller:
     )
 
 
-def _corners(robot: Robot) -> tuple[dict[str, int], list[float]]:
-    """The wheel (index) in each corner of the controller, and the sign (N,) of each wheel's rate driving forward."""
-    equations = robot.signal_equations
-    signs = np.sign(equations[:, 0])
-    wheels = {}
-    for index, (sign, row) in enumerate(zip(signs, equations, strict=True)):
-        corner = next((name for name, pattern in _CORNERS.items() if (sign * np.sign(row) == pattern).all()), None)
-        if corner is not None and robot.measured[index].kind == "mecanum":
-            wheels[corner] = index
-    if len(wheels) < 4 or len(robot.measured) > 4:
-        raise ConfigError(
-            "ros2_controllers: mecanum_drive_controller needs one mecanum wheel in each corner, with rollers that form "
-            f"an X or an O seen from above; {', '.join(robot.wheel_names)} do not; check roller angles, or use c_header"
-        )
-    return {corner: wheels[corner] for corner in _CORNERS}, signs.tolist()
-
-
-@dataclass(frozen=True)
-class OmniWheelDrive:
-    """The parameters of omni_wheel_drive_controller: order of the wheels (indices), radii in m, offset in rad.
+def omni_wheel_matrix(
+    order: Sequence[int], robot_radius: float, wheel_radius: float, wheel_offset: float, clockwise: Sequence[bool] = ()
+) -> Array:
+    """The inverse kinematic matrix (3, N) of omni_wheel_drive_controller, columns in the robot's order.
 
     The controller solves, by least squares over its wheels i = 0 .. N-1, counted counter-clockwise,
 
         wheel_radius * omega_i = sin(t_i) vx - cos(t_i) vy - robot_radius w,    t_i = wheel_offset + 2 pi i / N     (6)
 
     (odometry.cpp of the package, 2025), which with omega_i negated is the wheel equation of omnibench: its positive
-    rate turns the robot clockwise. clockwise (N,): True for a wheel whose positive rate turns the robot clockwise, as
-    the controller has it.
+    rate turns the robot clockwise. order: indices of the wheels. Radii in m, offset in rad. clockwise (N,): True for a
+    wheel whose positive rate turns the robot clockwise, as the controller has it; default: none.
     """
-
-    order: tuple[int, ...]
-    robot_radius: float
-    wheel_radius: float
-    wheel_offset: float
-    clockwise: tuple[bool, ...] = ()
-
-    @property
-    def matrix(self) -> Array:
-        """The inverse kinematic matrix (3, N) that the controller uses, columns in the robot's order."""
-        count = len(self.order)
-        angles = self.wheel_offset + 2 * np.pi * np.arange(count) / count
-        matrix = np.empty((3, count))
-        matrix[0, self.order] = -2 * self.wheel_radius / count * np.sin(angles)
-        matrix[1, self.order] = 2 * self.wheel_radius / count * np.cos(angles)
-        matrix[2, self.order] = self.wheel_radius / (count * self.robot_radius)
-        return np.where(self.clockwise, -matrix, matrix) if self.clockwise else matrix
+    count = len(order)
+    angles = wheel_offset + 2 * np.pi * np.arange(count) / count
+    matrix = np.empty((3, count))
+    matrix[0, order] = -2 * wheel_radius / count * np.sin(angles)
+    matrix[1, order] = 2 * wheel_radius / count * np.cos(angles)
+    matrix[2, order] = wheel_radius / (count * robot_radius)
+    return np.where(clockwise, -matrix, matrix) if clockwise else matrix
 
 
-def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
-    """The parameters whose matrix is closest to ``matrix`` (3, N) in the sum of squares of each row.
+def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
+    """The controller whose matrix is closest to ``matrix`` (3, N) of the robot's centre in the sum of squares of rows.
 
     The matrix of Eq. (6) is, in columns,
 
@@ -582,7 +489,7 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     if count < 3:
         raise ConfigError("ros2_controllers: omni_wheel_drive_controller needs three wheels or more; use c_header")
     # Order counter-clockwise from the first wheel on.
-    clockwise = tuple(wheel.lever < 0 for wheel in wheels)
+    clockwise = [wheel.lever < 0 for wheel in wheels]
     angles = np.array([wheel.axle if wheel.lever > 0 else wheel.axle + math.pi for wheel in wheels])
     turned = np.mod(angles - angles[0], 2 * np.pi)
     # By rounding, the first wheel or one at the same angle may be a full turn away.
@@ -602,40 +509,30 @@ def closest_omni_wheel_drive(robot: Robot, matrix: Array) -> OmniWheelDrive:
     turn = float(columns[2].mean())
     if turn <= 0 or abs(scaled) == 0:
         raise ConfigError(_NO_TURN)
-    return OmniWheelDrive(
-        tuple(order.tolist()), abs(scaled) / (count * turn), abs(scaled), float(np.angle(scaled)), clockwise
-    )
-
-
-def omni_wheel_drive(robot: Robot, matrix: Array) -> Controller:
-    """The controller closest to a matrix (3, N) of the robot's centre. ConfigError: it cannot describe this robot."""
-    fitted = closest_omni_wheel_drive(robot, matrix)
-    names = ", ".join(joint_name(robot.wheel_names[index]) for index in fitted.order)
-    off = 100 * (fitted.matrix - matrix) / np.abs(matrix).max(axis=1, keepdims=True)
+    values = {
+        "wheel_offset": float(np.angle(scaled)),
+        "robot_radius": abs(scaled) / (count * turn),
+        "wheel_radius": abs(scaled),
+    }
+    closest = omni_wheel_matrix(order.tolist(), **values, clockwise=clockwise)
+    off = 100 * (closest - matrix) / np.abs(matrix).max(axis=1, keepdims=True)
     rows = "; ".join(", ".join(f"{value:+.2f}" for value in row) for row in off)
     sign = (
         "a positive joint velocity turns the robot clockwise for this controller, counter-clockwise for the "
         "calibration: reverse the joints' axes"
     )
-    if any(fitted.clockwise):
-        as_they_are = [name for name, turns in zip(robot.wheel_names, fitted.clockwise, strict=True) if turns]
+    if any(clockwise):
+        as_they_are = [name for name, turns in zip(robot.wheel_names, clockwise, strict=True) if turns]
         sign += f", but not of {', '.join(as_they_are)}"
     return Controller(
         "omni_wheel_drive_controller",
-        (
-            Parameter("wheel_names", f"[{names}]", "counter-clockwise"),
-            Parameter("wheel_offset", fitted.wheel_offset, "rad"),
-            Parameter("robot_radius", fitted.robot_radius, "m"),
-            Parameter("wheel_radius", fitted.wheel_radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
-        fitted.matrix,
+        {"wheel_names": [joint_name(robot.wheel_names[index]) for index in order], **values},
+        closest,
         "one wheel radius, one distance and equal spacing",
         "wheel_names",
         f": its elements are off by ({rows}) % of their row's largest, rows x; y; heading, wheels "
         f"{', '.join(robot.wheel_names)}",
         (sign,),
-        covariances="diagonal_covariance.{}",
     )
 
 
@@ -673,13 +570,12 @@ def tricycle(robot: Robot, matrix: Array) -> Controller:
     offset = _steering_offset(robot, seen, reading, base, abs(wheelbase))
     return Controller(
         "tricycle_controller",
-        (
-            Parameter("traction_joint_name", joint_name(name)),
-            Parameter("steering_joint_name", f"steering_{name}_joint"),
-            Parameter("wheelbase", radius / turn, "m"),
-            Parameter("wheel_radius", radius, "m"),
-            Parameter("open_loop", "false"),
-        ),
+        {
+            "traction_joint_name": joint_name(name),
+            "steering_joint_name": f"steering_{name}_joint",
+            "wheelbase": radius / turn,
+            "wheel_radius": radius,
+        },
         _tricycle_matrix(radius, turn, 0.0) @ reading,
         "one wheel radius and one wheelbase",
         "traction_joint_name and steering_joint_name",

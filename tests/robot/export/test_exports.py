@@ -327,14 +327,17 @@ def test_the_controller_drives_a_design_robot_exactly(angles: tuple[float, ...])
 
 def test_no_other_parameters_are_closer_to_a_calibrated_matrix() -> None:
     matrix = published_matrix("palacin2023_eq8")
-    fitted = ros2_controllers.closest_omni_wheel_drive(APR_02, matrix)
+    values = ros2_controllers.omni_wheel_drive(APR_02, matrix).values
+    order = [
+        APR_02.wheel_names.index(name.removeprefix("wheel_").removesuffix("_joint")) for name in values["wheel_names"]
+    ]
 
     def distance(vector: Array) -> float:
-        return float(np.square(ros2_controllers.OmniWheelDrive(fitted.order, *vector).matrix - matrix).sum())
+        return float(np.square(ros2_controllers.omni_wheel_matrix(order, *vector) - matrix).sum())
 
     start = (0.195, 0.148, math.pi / 3)
     search = minimize(distance, start, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-18})
-    found = (fitted.robot_radius, fitted.wheel_radius, fitted.wheel_offset)
+    found = [values[name] for name in ("robot_radius", "wheel_radius", "wheel_offset")]
     np.testing.assert_allclose(found, search.x, atol=1e-6)
     assert distance(np.array(found)) <= search.fun + 1e-15
 
@@ -348,7 +351,7 @@ def test_a_wheel_that_turns_the_robot_clockwise_keeps_its_sign() -> None:
     assert parameters(export, NODE) == parameters(exported(APR_02), NODE)
     assert "reverse the joints' axes, but not of b" in " | ".join(export.warnings)
     matrix = machine.inverse_kinematic_matrix
-    np.testing.assert_allclose(ros2_controllers.closest_omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
+    np.testing.assert_allclose(ros2_controllers.omni_wheel_drive(machine, matrix).matrix, matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize(("robot", "turn"), [(DIFF, "7.20 deg a turn, "), (CAR, "mm and 7.20 deg circle")])
