@@ -142,7 +142,7 @@ def reference_faults(evidence: Evidence) -> Iterator[Finding]:
         what += "start pose is uncertain then, and what was driven before the first sample is lost"
         severity: Severity = "warning" if len(moving) > count / 2 else "note"
         where = runs_in_words(moving, count)
-        fix = "let the robot stand for a second at the begin of every run, with recording on"
+        fix = "let the robot stand for a second at the beginning of every run, with recording on"
         yield Finding(kind="not_at_rest", what=what, where=where, severity=severity, fix=fix)
 
 

@@ -466,7 +466,7 @@ def _in_words(difference: SessionDifference) -> str:
         f"{f'the radius of wheel {one.wheel} looks' if one.wheel else 'the radii of all wheels look'} {_size(one)}"
         for one in difference.radii
     )
-    what = changes or "more than the wheels' radii is another (floor, load, or the mount of wheels or reference)"
+    what = changes or "more differs than the wheels' radii (floor, load, or the mount of wheels or reference)"
     return (
         f"The sessions differ: in {difference.session} against {others}, {plural(difference.commands, 'command')} that "
         f"they share, {what}; repetitions do not explain it (chance {_chance(difference.chance)})."

@@ -259,7 +259,8 @@ class EvaluationResult(Result):
         assert self.evaluation is not None
         assert self.calibration is not None
         assert self.dataset is not None
-        return calibration_document(self.calibration, self.dataset, self.evaluation.held_out, self.evaluation.warnings)
+        told = self.evaluation
+        return calibration_document(self.calibration, self.dataset, told.held_out, told.warnings, told.sessions)
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         assert self.evaluation is not None
@@ -304,7 +305,7 @@ def next_step(
         return NextStep(f"{file} is worse than the design: do not use it", "see what the recordings lack", inspect)
     if found == "undecided":
         more = "record more runs for validation; what these tell"
-        return NextStep(f"whether {file} is better than the design is open", more, inspect)
+        return NextStep(f"whether {file} is better than the design is open: do not rely on it yet", more, inspect)
     other = ("omnibench", "evaluate", file, "DATASET")
     return NextStep(f"{file} was not judged by other runs", "try it on a recording that it was not fitted to", other)
 
@@ -337,11 +338,16 @@ def _models(calibration: Calibration, dataset: Dataset) -> Models:
 
 
 def calibration_document(
-    found: Calibration | CalibrationRun, dataset: Dataset, verdict: HeldOutVerdict, warnings: Sequence[str] = ()
+    found: Calibration | CalibrationRun,
+    dataset: Dataset,
+    verdict: HeldOutVerdict,
+    warnings: Sequence[str] = (),
+    sessions: Sequence[str] = (),
 ) -> page.Document:
     """The report of a calibration on the runs of a data set: on those that the verdict is of, or else on all.
 
-    DataError: a recording lacks what an effect of the calibration needs.
+    sessions: sentences on those that differ or could not be compared. DataError: a recording lacks what an effect of
+    the calibration needs.
     """
     judged = [run for run in dataset.trajectories if run.id in set(verdict.runs)]
     runs, which = (judged, "held-out") if judged else (list(dataset.trajectories), "recorded")
@@ -358,8 +364,9 @@ def calibration_document(
     ]
     if verdict.improvement is not None:
         known = verdict.low is not None and verdict.high is not None
-        interval = f"95 %: {percent(verdict.low)} to {percent(verdict.high)}" if known else "no interval: too few"
-        tiles.append(page.Fact("Final error removed", percent(verdict.improvement), interval))
+        ends = (percent(None if each is None else -each, signed=True) for each in (verdict.high, verdict.low))
+        interval = f"95 %: {' to '.join(ends)}" if known else "no interval: too few"
+        tiles.append(page.Fact("Change of the final error", percent(-verdict.improvement, signed=True), interval))
     headings = (f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS)
     of_motions = page.Table(
         f"Mean errors of the final pose of the {which} runs", page.columns("motion", "runs", *headings), rows
@@ -390,9 +397,11 @@ def calibration_document(
         subtitle=f"{calibration.name}, on {plural(len(runs), f'{which} run')} of {dataset.name}",
         sections=(
             page.answer_section(
-                typeset(f"{verdict.sentence}."),
+                typeset(f"{verdict.sentence[:1].upper()}{verdict.sentence[1:]}."),
                 tiles,
-                paths_before_after(runs, models, which),
+                None,
+                *([page.Callout("Sessions", tuple(map(typeset, sessions)), "warning")] if sessions else []),
+                *filter(None, [paths_before_after(runs, models, which)]),
                 page.Callout("What these data leave open", tuple(map(typeset, warnings)), "warning"),
             ),
             *sections,

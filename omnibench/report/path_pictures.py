@@ -33,7 +33,7 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
     """The path of a typical run by the reference and two models, and the ends of all runs; None without a run.
 
     models: before and after. which: the runs in words, such as ``held-out``. Runs without poses are left out. Typical
-    is the run whose error, m and rad as one length, falls by the median; a turn on the spot has no path to see.
+    is the run whose error, m and rad as one length, changes by the median; a turn on the spot has no path to see.
     """
     runs = [run for run in runs if run.has_poses]
     if not runs:
@@ -45,7 +45,9 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
     run = runs[ordered[(len(ordered) - 1) // 2]]
     title = motion_in_words(run.id, run.v, run.alpha, run.omega)
     figures = (_path(f"{title[0].upper()}{title[1:]}", run, models), _all_ends(runs, ends, models, which))
-    caption = "The run whose error falls by the median. Circle: start; dots: ends. In the titles: distance of the end "
+    caption = (
+        "The run whose error changes by the median. Circle: start; dots: ends. In the titles: distance of the end "
+    )
     caption += "from the reference's, and turn between them, before and after."
     items = (REFERENCE_ITEM, *(item for item, _ in models))
     return FigureGrid(figures, items, 2, caption, "paths-before-after")

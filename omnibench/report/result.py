@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from omnibench.report.blocks import Column, Document, FigureGrid, Paragraph, Row, Table, Tone
+from omnibench.report.blocks import Block, Code, Column, Document, FigureGrid, Paragraph, Row, Table, Tone
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -99,8 +99,9 @@ def with_next_step(document: Document, step: NextStep) -> Document:
     """A report whose first section says, below its sentence, what to do next."""
     answer, *others = document.sections
     first, *rest = answer.blocks
-    typed = f": {join(map(str, step.command))}" if step.command else "."
-    following = [Paragraph(f"Next, {step.then}{typed}")] if step.then else []
+    following: list[Block] = [Paragraph(f"Next, {step.then}.")] if step.then else []
+    if step.command:
+        following = [Code(join(map(str, step.command)), f"Next, {step.then}:")]
     return replace(document, sections=(replace(answer, blocks=(first, *following, *rest)), *others))
 
 

@@ -39,9 +39,10 @@ def test_calibrate_and_evaluate_write_a_page_that_says_what_to_do_and_do_not_ove
     save_dataset(synthetic_dataset(), tmp_path / "data")
     succeeded(run_here("calibrate", "data", "-o", "c.yaml", "--report", "first.html", cwd=tmp_path))
     ending = succeeded(run_here("evaluate", "c.yaml", "data", "--report", "second.html", cwd=tmp_path)).stderr
-    what_to_do = ending.partition("; next, ")[2].replace(":\n  ", ": ").strip()
+    what_to_do, _, command = ending.partition("; next, ")[2].partition(":\n  ")
     for page_file in ("first.html", "second.html"):
         written = re.sub("<[^>]+>", "", (tmp_path / page_file).read_text())
         assert "Radii, lengths and angles" in written
-        assert f"Next, {what_to_do}" in written
+        assert f"Next, {what_to_do}:" in written
+        assert command.strip() in written
     assert_refused(run_here("evaluate", "c.yaml", "data", "--report", "second.html", cwd=tmp_path), "second.html")

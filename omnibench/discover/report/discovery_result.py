@@ -63,7 +63,9 @@ class DiscoveryResult(Result):
         kind, to = ("extended", "c_header") if discovery.extends else ("plain", "ros2_controllers")
         command = ("omnibench", "export", folder / CALIBRATION_FILES[kind], "--to", to)
         if discovery.extends:
-            return NextStep("the extended calibration holds what the matrix lacked", "use it on the robot", command)
+            what = "closes the gap without a name" if discovery.verdict == "unknown" else "holds what the matrix lacked"
+            then = "export it" if discovery.dataset.simulated else "use it on the robot"
+            return NextStep(f"the extended calibration {what}", then, command)
         return NextStep("nothing was added to the matrix", "use the plain calibration", command)
 
     def tables(self) -> Sequence[Table]:

@@ -144,7 +144,7 @@ def test_the_first_screen_says_how_sure_the_cause_is() -> None:
     assert "(rotation translation coupling; it may as well be load transfer)" in alike
     assert "found; which of a class is open; weight of the name 52.0 %" in alike
     assert "likeliest, but no name is sure" in whole(lambda: replace(named(), verdict="unknown")).text
-    assert "an unnamed term closes" in whole(lambda: replace(named(), verdict="unknown", effects=())).text
+    assert "a term without a name closes" in whole(lambda: replace(named(), verdict="unknown", effects=())).text
 
 
 def test_errors_before_and_after_stand_beside_the_floor(report: Page) -> None:
