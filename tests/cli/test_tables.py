@@ -240,12 +240,6 @@ def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> No
     )
 
 
-def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
-    runs = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(5))
-    lines = calibration_lines(make_dataset("tricycle", TRICYCLE, RECORDED, runs))
-    assert any(line.startswith("mount_x") for line in lines)
-
-
 def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> None:
     wheels = (Wheel(name=f"{n}", radius=0.05, distance=0.2, angle=n * 2 * np.pi / 3) for n in range(3))
     robot = Robot(name="omni", wheels=tuple(wheels))

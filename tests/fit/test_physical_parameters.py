@@ -46,8 +46,7 @@ ANSWERS: list[tuple[str, dict[str, Any]]] = [
     ("closed_form", {}),
     ("closed_form", {"unidentified": "keep"}),
     ("least_squares", {}),
-    ("trajectory_ml", {}),
-    ("posterior", {}),
+    ("map", {}),
     ("parametric", {}),
 ]
 
@@ -135,8 +134,8 @@ def test_published_and_design_matrices_have_values_without_intervals() -> None:
     assert max(abs(each.deviation) for each in run.parameters) < 1e-9
 
 
-def test_the_lost_rate_of_the_posterior_is_among_the_parameters() -> None:
-    run = calibrate(recording(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix), "posterior")
+def test_the_lost_rate_of_map_is_among_the_parameters() -> None:
+    run = calibrate(recording(DIFFERENTIAL, DIFFERENTIAL.inverse_kinematic_matrix), "map")
     (effect,) = run.calibration.effects
     lost = named(run)["lost_rate"]
     assert lost.value == -effect.parameters["c"]

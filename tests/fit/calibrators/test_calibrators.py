@@ -282,7 +282,7 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
     return error(calibrate(clean, calibrator, cost=cost, budget=Budget(evaluations=4000)), judged)
 
 
-@pytest.mark.parametrize("loss", ROBUST)
+@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("calibrator", "cost", "robot"),
     [
