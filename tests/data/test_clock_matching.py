@@ -98,6 +98,9 @@ def test_clocks_are_within_five_standard_errors(offset: float, drift: float, see
     (clock,) = matched(streams(seed, offset, drift))
     assert np.abs(errors(clock, offset, drift)).max() < 5.0
     assert clock.middle_error < 0.02
+    stamps = np.linspace(0.0, clock.length, 5)
+    added = clock.middle + clock.drift * (stamps - clock.length / 2)
+    np.testing.assert_allclose(clock.corrected(stamps), stamps + added, atol=1e-12)
 
 
 def test_a_short_run_with_sparse_poses_is_not_surer_of_its_clock_than_its_scatter_allows() -> None:

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lanes import slow
 from motions import RING
 from motions import driven as rolled
-from sample_robots import APR_02, DIFFERENTIAL, WHEELED
+from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE
 from wheeled_recordings import PERIOD, recorded
 
 from omnibench.data.dataset import Dataset, make_dataset
@@ -63,7 +64,9 @@ def test_radii_and_track_of_two_wheels_are_true_within_the_intervals_of_every_ca
     assert found["track"].design == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("robot", WHEELED, ids=lambda robot: robot.name)
+@pytest.mark.parametrize(
+    "robot", [DIFFERENTIAL, SWERVE, *slow(SKID, MECANUM, TRICYCLE, CAR)], ids=lambda robot: robot.name
+)
 def test_the_file_has_the_parameters_of_the_run_of_every_class(robot: Robot) -> None:
     run = calibrate(recording(robot, robot.inverse_kinematic_matrix))
     assert run.calibration.parameters == named(run)

@@ -490,6 +490,7 @@ def test_the_tolerance_that_was_met_of_cost_or_step_is_named(name: str, options:
 # Section 4.2: the physical parameters of every wheel.
 
 
+@pytest.mark.slow
 def test_without_noise_parametric_finds_the_hidden_geometry_and_reports_its_matrix() -> None:
     hidden = true_robot(synthetic_robot())
     runs = synthetic_trajectories(synthetic_robot())
