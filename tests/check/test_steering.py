@@ -127,7 +127,7 @@ def test_the_zero_of_one_module_is_named_by_the_wheels_that_it_contradicts(wheel
     assert not np.delete(offsets, wheel).any()
 
 
-@pytest.mark.parametrize("degrees", [0.0, 2.0, -3.0])
+@pytest.mark.parametrize("degrees", [0.0, 2.0, *slow(-3.0)])
 def test_a_small_zero_of_a_cars_steering_is_warned_of_with_its_option(degrees: float) -> None:
     data = recorded("car")
     runs = [replace(run, steering=plus(degrees)(run.steering)) for run in data.trajectories if run.steering is not None]

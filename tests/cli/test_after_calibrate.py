@@ -78,13 +78,10 @@ def test_scans_are_matched_with_the_odometry_of_the_default_calibration(command:
     assert load_dataset(Path("data")).trajectories
 
 
-@pytest.mark.parametrize("former", ["posterior", "trajectory_ml"])
-def test_a_former_name_of_a_calibrator_is_one_line_of_warning(
-    former: str, command: Command, prepared: Prepared
-) -> None:
-    printed = succeeded(command("calibrate", prepared.data, "--calibrator", former, "-o", "c.yaml"))
+def test_a_former_name_of_a_calibrator_is_one_line_of_warning(command: Command, prepared: Prepared) -> None:
+    printed = succeeded(command("calibrate", prepared.data, "--calibrator", "posterior", "-o", "c.yaml"))
     lines = [line for line in printed.stderr.splitlines() if "now called" in line]
-    assert lines == [f"warning: calibrator {former} is now called map"]
+    assert lines == ["warning: calibrator posterior is now called map"]
     assert "FutureWarning" not in printed.stderr
     assert read_calibration(Path("c.yaml")).provenance.calibrator == "map"
 

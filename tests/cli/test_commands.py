@@ -30,7 +30,6 @@ from timing import PATIENCE
 
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.robot.calibration import EffectTerm, read_calibration, write_calibration
-from omnibench.robot.kinematics import published_matrix
 from omnibench.testing.synthetic import synthetic_robot
 
 
@@ -138,17 +137,6 @@ def test_what_only_a_live_node_can_run_is_not_exported(command: Command, prepare
     ending = command("evaluate", tmp_path / "effects.yaml", prepared.data).stderr
     assert ending.endswith(":\n  omnibench guide live\n")
     assert " export " in command("evaluate", prepared.calibration, prepared.data).stderr
-
-
-def test_a_calibration_comes_close_to_the_truth_and_says_where_it_is_from(prepared: Prepared) -> None:
-    calibration = read_calibration(prepared.calibration)
-    assert np.abs(calibration.matrix_array - published_matrix("palacin2023_eq8")).max() < 0.005
-    assert calibration.noise is not None
-    deviations = np.sqrt(np.diag(calibration.covariance))
-    assert (deviations > 0).all()
-    assert (deviations < 0.05).all()
-    assert calibration.provenance.dataset_hash == load_dataset(prepared.data).hash
-    assert (calibration.provenance.simulated, calibration.provenance.calibrator) == (True, "closed_form")
 
 
 def test_settings_reach_the_calibrator_and_infinity_is_null_in_json(command: Command, prepared: Prepared) -> None:

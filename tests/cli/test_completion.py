@@ -3,17 +3,14 @@
 from pathlib import Path
 
 import pytest
-from commands import ENVIRONMENT, ROOT, python, succeeded
+from commands import ENVIRONMENT, ROOT, Command, python, succeeded
 
 PROGRAM = "import sys; sys.argv[0] = 'omnibench'; from omnibench.__main__ import main; main()"
 
 
-def completed(typed: str, folder: Path) -> set[str]:
-    """What bash is told to offer for the last word of a line."""
-    line = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_OMNIBENCH_COMPLETE": "complete_bash"}
-    return set(
-        succeeded(python(PROGRAM, cwd=folder, env=ENVIRONMENT | line | {"PYTHONPATH": str(ROOT)})).stdout.split()
-    )
+def line(typed: str) -> dict[str, str]:
+    """How bash asks what to offer for the last word of a line."""
+    return {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_OMNIBENCH_COMPLETE": "complete_bash"}
 
 
 @pytest.mark.parametrize(
@@ -35,14 +32,17 @@ def completed(typed: str, folder: Path) -> set[str]:
         ("omnibench list eff", {"effects"}),
     ],
 )
-def test_a_name_is_completed(typed: str, names: set[str], tmp_path: Path) -> None:
-    assert completed(typed, tmp_path) == names
+def test_a_name_is_completed(typed: str, names: set[str], command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in line(typed).items():
+        monkeypatch.setenv(name, value)
+    assert set(succeeded(command()).stdout.split()) == names
 
 
 def test_no_plug_in_runs_while_somebody_types(tmp_path: Path) -> None:
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "loud.py").write_text("raise SystemExit('it ran')\n", encoding="utf-8")
-    assert "closed_form" in completed("omnibench calibrate --calibrator ", tmp_path)
+    asked = ENVIRONMENT | line("omnibench calibrate --calibrator ") | {"PYTHONPATH": str(ROOT)}
+    assert "closed_form" in succeeded(python(PROGRAM, cwd=tmp_path, env=asked)).stdout.split()
 
 
 def test_the_script_of_a_shell_is_shown(tmp_path: Path) -> None:

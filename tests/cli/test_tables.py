@@ -15,7 +15,7 @@ import pytest
 from commands import COMMAND, ENVIRONMENT, Command, compared_here, rows, search, succeeded, write_config
 from report_page import Page, on_terminal
 from rich.console import Console
-from sample_robots import APR_02, DIFFERENTIAL, TRICYCLE, WHEELED
+from sample_robots import APR_02, DIFFERENTIAL, SWERVE, TRICYCLE
 from syrupy.assertion import SnapshotAssertion
 from timing import PATIENCE
 from wheeled_recordings import PERIOD as RECORDED
@@ -208,7 +208,7 @@ def test_a_matrix_has_an_element_for_each_row_and_drive_signal() -> None:
     assert not any("wheel front" in line for line in lines)
 
 
-@pytest.mark.parametrize("robot", [APR_02, *WHEELED], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [APR_02, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
 def test_a_calibration_shows_physical_parameters_then_the_matrix_on_a_screen_of_80_columns(robot: Robot) -> None:
     runs = recorded(robot, robot.inverse_kinematic_matrix, np.random.default_rng(5))
     run = calibrate(make_dataset(robot.name, robot, RECORDED, runs), mount="fit")
@@ -238,12 +238,6 @@ def test_a_parameter_has_its_design_value_change_and_interval_in_its_row() -> No
         " ".join(row.split())
         == f"radius_left 0.05000 {radius.value:.5f} m {radius.deviation_percent:+.2f} % {interval}"
     )
-
-
-def test_the_geometry_of_a_tricycle_is_shown_with_the_place_of_its_tracked_point() -> None:
-    runs = recorded(TRICYCLE, TRICYCLE.inverse_kinematic_matrix, np.random.default_rng(5))
-    lines = calibration_lines(make_dataset("tricycle", TRICYCLE, RECORDED, runs))
-    assert any(line.startswith("mount_x") for line in lines)
 
 
 def test_an_element_that_is_0_but_for_rounding_has_no_share_of_the_design() -> None:

@@ -62,10 +62,6 @@ def test_a_data_set_comes_back_as_it_was(good: dict[Format, Path], fmt: Format) 
             np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
 
 
-def test_parquet_and_csv_have_the_hash_of_what_was_written(good: dict[Format, Path]) -> None:
-    assert {load_dataset(folder).hash for folder in good.values()} == {everything_known().hash}
-
-
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_names_made_of_digits_headings_of_many_turns_and_steering_angles_come_back(tmp_path: Path, fmt: Format) -> None:
     times = 0.1 * np.arange(1, 400)

@@ -29,7 +29,7 @@ from lanes import slow
 from outlier_study import EFFECT, TRUTH
 from outlier_study import simulated as with_directions
 from recording_samples import in_room
-from sample_robots import DIFFERENTIAL, SWERVE, TRICYCLE
+from sample_robots import DIFFERENTIAL, TRICYCLE
 from scipy.stats import binomtest, chi2
 from screening_samples import FIRST, SECOND, THIRD, screening
 from wheeled_samples import driven
@@ -51,7 +51,7 @@ from omnibench.fit.trajectory_fit import Whitened, usable_runs
 from omnibench.registry import effects
 from omnibench.robot.calibration import Noise
 from omnibench.robot.effects.effect import ActuatorEffect, make_term
-from omnibench.robot.kinematics import Array, Robot
+from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import read_simulation, simulate_dataset
@@ -630,18 +630,17 @@ def test_whichever_of_the_look_alikes_is_right_is_named_after_the_proposed_runs(
     assert found.effects[0].weight >= 0.95
 
 
-@pytest.mark.parametrize("robot", [DIFFERENTIAL, TRICYCLE, SWERVE], ids=lambda robot: robot.name)
-def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded(robot: Robot) -> None:
-    fit = steered_half(plain_fit(driven(robot)))
+def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded() -> None:
+    fit = steered_half(plain_fit(driven(TRICYCLE)))
     candidates = candidate_runs(fit, [effects.create("heading_drift")])
     assert len({candidate.timed.command.speed for candidate in candidates}) > 2
     assert any(candidate.timed.command.turn_rate for candidate in candidates)
     for quantity in ("rates", "steering"):
         done, asked = (
-            [np.abs(values).max() for run in runs if (values := getattr(run, quantity)) is not None and values.size]
+            [np.abs(getattr(run, quantity)).max() for run in runs]
             for runs in (fit.runs, [candidate.run for candidate in candidates])
         )
-        assert not asked or max(asked) <= max(done) * 1.0001
+        assert max(asked) <= max(done) * 1.0001
 
 
 def steered_half(fit: fitting.Fit) -> fitting.Fit:

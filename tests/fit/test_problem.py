@@ -10,7 +10,7 @@ from commands import refused
 from fit_samples import Scripted, box_between, make_problem, noisy_trajectories
 from hypothesis import given
 from hypothesis import strategies as st
-from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE, WHEELED
+from sample_robots import APR_02, CAR, DIFFERENTIAL, SKID, SWERVE, TRICYCLE, WHEELED
 
 from omnibench.config import validate
 from omnibench.data.dataset import make_dataset
@@ -363,12 +363,6 @@ def test_a_longer_wheelbase_turns_a_car_less() -> None:
     geometry = WheelGeometry(CAR)
     longer = geometry.matrices((geometry.start * [1.0, 1.25])[None])[0]
     np.testing.assert_allclose(longer, CAR.inverse_kinematic_matrix * [[1.0], [1.0], [0.8]], rtol=0, atol=1e-15)
-
-
-def test_the_limits_of_a_mecanum_geometry_hold_its_design() -> None:
-    bounds = WheelGeometry(MECANUM).bounds
-    assert (bounds.lower < WheelGeometry(MECANUM).start).all()
-    assert (bounds.upper > WheelGeometry(MECANUM).start).all()
 
 
 # However a calibrator ends, its run is a row with an outcome and a reason.

@@ -151,11 +151,6 @@ def test_other_types_of_poses_are_read(tmp_path: Path, kind: str) -> None:
     assert odometry_error(read(write_rosbag2(tmp_path / "drive", [*wheels, *poses]))) < 1e-9
 
 
-def test_samples_that_were_lost_do_not_matter_to_positions(tmp_path: Path) -> None:
-    kept = edited(messages(DRIVE), WHEELS, lambda _: None, every=3)
-    assert odometry_error(read(write_mcap(tmp_path / "drive", kept))) < 1e-3  # the robot sets off within a sample
-
-
 def test_the_command_imports_a_bag(command: Command, tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "drive", part(12.4))
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(ROBOT.model_dump(mode="json")))

@@ -427,8 +427,7 @@ def test_odometry_is_no_reference_unless_named(tmp_path: Path) -> None:
     assert odometry_error(read(source, pose_topic="tracker")) < 0.05
 
 
-@pytest.mark.parametrize("late", [0, 7_000_000, 20_000_000])
-@pytest.mark.parametrize("integration", ["euler", "arc"])
+@pytest.mark.parametrize(("late", "integration"), [(0, "euler"), (20_000_000, "arc")])
 def test_odometry_that_the_robot_made_itself_is_refused(tmp_path: Path, late: int, integration: Integration) -> None:
     wrong = TRUTH * np.array([[1.1], [1.1], [0.9]])  # radii and distances that the driver was told
     seconds = (DRIVE.stamps - DRIVE.stamps[0]) / 1e9

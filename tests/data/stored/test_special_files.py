@@ -121,7 +121,7 @@ def test_a_command_refuses_a_pipe_in_one_line(folder: Path, arguments: tuple[str
     assert_refused(run_here(*arguments, cwd=folder.parent), "FILE")
 
 
-@pytest.mark.parametrize("name", ["wheels", "poses", "trajectories"])
+@pytest.mark.parametrize("name", ["wheels", "trajectories"])
 def test_a_small_table_that_unpacks_to_gigabytes_is_refused_before_it_is_read(folder: Path, name: str) -> None:
     (folder / f"{name}.csv").unlink()
     packed(folder / f"{name}.parquet")

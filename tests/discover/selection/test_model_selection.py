@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ from omnibench.discover.selection.model_selection import Dependences, covariate_
 from omnibench.discover.selection.unknown_term import add_smooth_terms
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
-from omnibench.robot.calibration import Calibration, read_calibration, write_calibration
+from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Parameter
 from omnibench.robot.kinematics import Robot
 
@@ -123,15 +122,6 @@ def test_an_effect_that_leaves_most_to_the_generic_bases_is_given_up_and_stays_t
     assert found.left_share == pytest.approx(0.5, abs=0.02)
     assert found.known < 0.05
     assert found.left.p_value(1) < 1e-6  # what is left is looked for beyond the matrix alone
-
-
-def test_an_effect_of_an_impossible_sign_has_even_odds_and_gets_no_name() -> None:
-    right, wrong = (
-        selected(screening({DRIFT: FIRST}, BASES, [0, sign * 20, 0, 0, 0], parameter=POSITIVE)) for sign in (1, -1)
-    )
-    assert names(right) == [DRIFT]
-    assert wrong.chosen == ()
-    assert wrong.known == pytest.approx(0.5)
 
 
 def test_what_one_run_alone_shows_is_no_effect() -> None:
@@ -564,14 +554,6 @@ def test_most_of_the_gap_closes_on_a_held_out_session_by_a_step_without_a_name(
     first, last = (step.held_out for step in found.steps)
     assert last < first
     assert len([note for note in found.notes if "unnamed term" in note]) == 1
-
-
-def test_the_calibration_file_predicts_the_same(grooved: tuple[Dataset, Truth, Discovery], tmp_path: Path) -> None:
-    dataset, _, found = grooved
-    write_calibration(found.extended, tmp_path / "extended.yaml")
-    log = dataset.split("validation")[0].reference_log
-    again = read_calibration(tmp_path / "extended.yaml").model.reported([log])[0]
-    np.testing.assert_array_equal(again, found.extended.model.reported([log])[0])
 
 
 def test_the_calibration_file_has_the_physical_parameters(grooved: tuple[Dataset, Truth, Discovery]) -> None:

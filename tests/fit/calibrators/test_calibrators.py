@@ -282,7 +282,7 @@ def on_clean(robot: Robot, calibrator: str, cost: str, seed: int = 1) -> float:
     return error(calibrate(clean, calibrator, cost=cost, budget=Budget(evaluations=4000)), judged)
 
 
-@pytest.mark.parametrize("loss", ROBUST)
+@pytest.mark.parametrize("loss", ["huber", pytest.param("student_t", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("calibrator", "cost", "robot"),
     [
@@ -490,6 +490,7 @@ def test_the_tolerance_that_was_met_of_cost_or_step_is_named(name: str, options:
 # Section 4.2: the physical parameters of every wheel.
 
 
+@pytest.mark.slow
 def test_without_noise_parametric_finds_the_hidden_geometry_and_reports_its_matrix() -> None:
     hidden = true_robot(synthetic_robot())
     runs = synthetic_trajectories(synthetic_robot())

@@ -79,12 +79,6 @@ def test_angles_hold_the_whole_motion_whatever_is_lost_or_comes_twice_or_in_anot
     assert stamps == sorted(set(stamps))
 
 
-def test_a_sample_that_never_came_is_counted_by_stamps_of_others_which_are_not_irregular(receiver: Receiver) -> None:
-    first, *_ = receiver.take(*[at(PERIOD * k, 5.0 + k, k, k) for k in range(50) if k not in (20, 31, 32)])
-    assert (first.angles.tolist(), first.duration) == ([0, 0, 0], 0)  # counting begins there
-    assert (receiver.counts.missing, receiver.counts.irregular) == (3, 0)
-
-
 def test_a_duplicate_and_a_late_sample_make_no_step(receiver: Receiver) -> None:
     receiver.take(at(0, 0, 0, 0), at(0.01, 1, 1, 1), at(0.03, 3, 3, 3))
     assert receiver.take(at(0.03, 3, 3, 3)) == []
@@ -322,12 +316,15 @@ def test_irregular_periods_are_taken_as_they_are_stamped(receiver: Receiver) -> 
     assert receiver.counts.irregular > 20
 
 
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.5])
-def test_missing_samples_are_all_counted_however_many_they_are(share: float, receiver: Receiver) -> None:
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_missing_samples_are_all_counted_however_many_they_are_and_none_is_irregular(
+    share: float, receiver: Receiver
+) -> None:
     rng = np.random.default_rng(1)
     kept = [0, *(k for k in range(1, 2999) if k < 20 or rng.random() > share), 2999]
-    receiver.take(*(at(k * PERIOD, 0.01 * k, 0.0, 0.0) for k in kept))
-    assert receiver.counts.missing == 3000 - len(kept)
+    first, *_ = receiver.take(*(at(k * PERIOD, 5.0 + 0.01 * k, 0.0, 0.0) for k in kept))
+    assert (first.angles.tolist(), first.duration) == ([0, 0, 0], 0)  # counting begins there
+    assert (receiver.counts.missing, receiver.counts.irregular) == (3000 - len(kept), 0)
 
 
 def test_a_robot_that_sends_more_rarely_from_now_on_misses_nothing_after_a_while(receiver: Receiver) -> None:

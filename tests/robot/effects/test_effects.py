@@ -26,7 +26,7 @@ from effect_samples import (
     streamed,
     term,
 )
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_robots import APR_02, CAR, DIFFERENTIAL, MECANUM, SKID, SWERVE, TRICYCLE
 
@@ -462,6 +462,7 @@ def a_member(name: str, robot: Robot, seed: int) -> Term:
 
 
 @pytest.mark.parametrize("name", [*EVERY_MOTION, *SMOOTH_MOTION])
+@settings(max_examples=15)
 @given(seed=seeds, data=st.data(), samples=st.integers(1, 60), integration=st.sampled_from(["euler", "arc"]))
 def test_a_stream_equals_a_batch_with_every_effect_in_every_form(
     name: str, integration: Integration, seed: int, data: st.DataObject, samples: int
