@@ -162,8 +162,7 @@ class _Runs(JobWatch[RunResult]):
     def _result(self, number: int, failure: Failure) -> RunResult:
         """The result of a run that left none. DataError: the disk refused it."""
         if isinstance(failure.error, _RunFailed):
-            result: RunResult = failure.error.args[0]
-            return result
+            return failure.error.args[0]
         if isinstance(failure.error, DataError):
             raise failure.error
         run, now = self._plan[number], time.monotonic()

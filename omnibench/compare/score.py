@@ -98,10 +98,7 @@ class SplitScorer:
 
 
 def score_fits(
-    config: CompareConfig,
-    fits: Sequence[PlannedFit],
-    results: Sequence[RunResult],
-    progress: Reporter = no_progress,
+    config: CompareConfig, fits: Sequence[PlannedFit], results: Sequence[RunResult], progress: Reporter = no_progress
 ) -> tuple[tuple[ScoredFit, ...], dict[str, Array]]:
     """Every fit with its errors, and by robot the errors (Z, 3) of the design values on all its runs.
 
