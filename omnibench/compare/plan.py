@@ -169,11 +169,6 @@ class Training:
         """The kinds that it is judged on, in the order of the folds."""
         return tuple(dict.fromkeys(kind for fold in self.folds for kind, runs in fold.judged.items() if runs))
 
-    @property
-    def fitted_kinds(self) -> tuple[str, ...]:
-        """The kinds of whose training errors are known."""
-        return tuple(dict.fromkeys(kind for fold in self.folds for kind in fold.fitted or ()))
-
 
 def divide(
     dataset: Dataset, robot: choices.RobotChoice, rules: Sequence[choices.TrainingChoice], place: str
@@ -184,7 +179,18 @@ def divide(
     the same training. DataError: no run is of a kind, or names its session, or is left to judge by.
     """
     runs = dataset.trajectories
-    of_kind = _indices_by_kind(runs, robot.kinds, place)
+    # Indices of the runs by kind, in the order of the kinds' first runs
+    of_kind: dict[str, list[int]] = {} if robot.kinds else {ONE_KIND: list(range(len(runs)))}
+    for index, run in enumerate(runs):
+        mine = [kind for kind, patterns in robot.kinds.items() if _named(run.id, patterns)]
+        if len(mine) > 1:
+            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(mine)}; make the patterns differ")
+        for kind in mine:
+            of_kind.setdefault(kind, []).append(index)
+    for kind, patterns in robot.kinds.items():
+        if kind not in of_kind:
+            found = ", ".join(run.id for run in runs[:4])
+            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
     trainings: dict[str, Training] = {}
     for rule in rules:
         for kind in rule.kinds:
@@ -206,24 +212,7 @@ def divide(
     return tuple(trainings.values())
 
 
-_ByKind = Mapping[str, Sequence[int]]  # indices of runs by kind, in the order of the kinds' first runs
-
-
-def _indices_by_kind(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> _ByKind:
-    if not kinds:
-        return {ONE_KIND: range(len(runs))}
-    of_kind: dict[str, list[int]] = {}
-    for index, run in enumerate(runs):
-        mine = [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, each) for each in patterns)]
-        if len(mine) > 1:
-            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(mine)}; make the patterns differ")
-        for kind in mine:
-            of_kind.setdefault(kind, []).append(index)
-    for kind, patterns in kinds.items():
-        if kind not in of_kind:
-            found = ", ".join(run.id for run in runs[:4])
-            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
-    return of_kind
+_ByKind = Mapping[str, Sequence[int]]  # indices of runs by kind
 
 
 def _divisions(

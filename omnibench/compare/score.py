@@ -107,6 +107,7 @@ def score_fits(
     """
     scored: dict[int, ScoredFit] = {}
     designs: dict[str, Array] = {}
+    no_answer: dict[str, Any] = {"vector": None, "matrix": None, "cost": None}
     for robot in {fit.robot.name: fit.robot for fit in fits}.values():
         progress(Progress("judging", len(scored), len(fits), "answer"))
         dataset, runs, choice = robot.dataset, robot.dataset.trajectories, config.cost or CostChoice()
@@ -137,10 +138,10 @@ def score_fits(
             except OmnibenchError as error:
                 if isinstance(error, PluginError) and config.datasets:  # its cost
                     raise
-                result, of_fit = _without_answer(result, Outcome.FAILED, str(error)), None
+                result, of_fit = replace(result, outcome=Outcome.FAILED, reason=str(error), **no_answer), None
             if of_fit is not None and not np.isfinite(of_fit).all() and config.robots:
-                result = _without_answer(result, Outcome.INVALID, "its odometry is not finite on a run that judges it")
-                of_fit = None
+                why = "its odometry is not finite on a run that judges it"
+                result, of_fit = replace(result, outcome=Outcome.INVALID, reason=why, **no_answer), None
             record = _record(fit, result, scores, design) if config.datasets else None
             scored[index] = ScoredFit(fit, result, of_fit, record, scores, design)
     progress(Progress("judging", len(fits), len(fits), "answer"))
@@ -161,10 +162,6 @@ def score_fits(
             gap = {"gap": done.row.train_cost / known[1] - 1, "gap_box": known[0]}
             in_order[index] = replace(done, row=done.row.model_copy(update=gap))
     return tuple(in_order), designs
-
-
-def _without_answer(result: RunResult, outcome: Outcome, reason: str) -> RunResult:
-    return replace(result, outcome=outcome, reason=reason, vector=None, matrix=None, cost=None)
 
 
 def known_of_box(done: ScoredFit, others: Iterable[tuple[PlannedFit, T]]) -> T | None:

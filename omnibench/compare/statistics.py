@@ -52,7 +52,12 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
     groups: dict[tuple[str, str], list[ScoredFit]] = {}
     for run in runs:
         groups.setdefault((run.record.dataset, run.record.label), []).append(run)
-    typical = {key: _typical(group) for key, group in groups.items()}
+    # The run of median training cost (the worse one of two), of those with an answer
+    typical: dict[tuple[str, str], ScoredFit | None] = {}
+    for key, group in groups.items():
+        answered = [run for run in group if run.record.train_cost is not None]
+        ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
+        typical[key] = ranked[len(ranked) // 2] if ranked else None
     intervals = RatioIntervals(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
@@ -149,13 +154,6 @@ def _best(competing: Sequence[ScoredFit], intervals: RatioIntervals) -> ScoredFi
     return min(rivals, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
-def _typical(group: Sequence[ScoredFit]) -> ScoredFit | None:
-    """The run of median training cost (the worse one of two), of those with an answer."""
-    answered = [run for run in group if run.record.train_cost is not None]
-    ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
-    return ranked[len(ranked) // 2] if ranked else None
-
-
 def _judged(run: ScoredFit) -> SplitScore:
     """The score that an answer is judged by: on the validation split where there is one."""
     return run.scores["validation" if "validation" in run.scores else "train"]
@@ -191,7 +189,8 @@ def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tupl
         methods = {name: _method(name, fits) for name, fits in of_methods.items()}
         errors = {name: _by_seeds(fits, folds, designs) for name, fits in of_methods.items()}
         places = [(kind, False) for kind in fit.training.kinds]
-        places += [(kind, True) for kind in fit.training.fitted_kinds if regime == AS_RECORDED]
+        trained = dict.fromkeys(kind for fold in folds for kind in fold.fitted or ())
+        places += [(kind, True) for kind in trained if regime == AS_RECORDED]
         for kind, fitted in places:
             listed = [
                 (number, index)

@@ -405,18 +405,22 @@ def calibration_document(
 
 def parameter_table(calibration: Calibration, title: str = "parameter") -> page.Table:
     """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
-    rows = []
-    for each in calibration.physical_parameters.values():
-        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
-            each.unit, (1.0, 5, each.unit)
-        )
-        share = None if each.unit == "rad" else each.deviation_percent
-        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if share is None else f"{share:+.2f} %"
-        ends = [] if each.low is None or each.high is None else [each.low, each.high]
-        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or NOTHING
-        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append((each.name, *values, unit, change, interval))
+    rows = [(each.name, *parameter_cells(each)) for each in calibration.physical_parameters.values()]
     return _values_table(title, rows)
+
+
+def parameter_cells(parameter: PhysicalParameter) -> tuple[str, str, str, str, str]:
+    """Design, value, their unit, the change and the interval of a parameter."""
+    factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
+        parameter.unit, (1.0, 5, parameter.unit)
+    )
+    # An angle's zero is a convention, so that no share of it means anything
+    share = None if parameter.unit == "rad" else parameter.deviation_percent
+    change = f"{factor * parameter.deviation:+.{decimals}f} {unit}" if share is None else f"{share:+.2f} %"
+    ends = [] if parameter.low is None or parameter.high is None else [parameter.low, parameter.high]
+    interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or NOTHING
+    design, value = (f"{factor * each:.{decimals}f}" for each in (parameter.design, parameter.value))
+    return design, value, unit, change, interval
 
 
 def _values_table(heading: str, rows: Sequence[Sequence[str]], note: str = "") -> page.Table:

@@ -20,8 +20,9 @@ from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.intervals import Interval
 from omnibench.fit.span import driven_span
 from omnibench.registry import costs
+from omnibench.report import blocks, numbers
 from omnibench.report.blocks import Block, Cell, Code, Column, Row, RowRole, Table
-from omnibench.report.blocks import columns as with_names
+from omnibench.report.calibration_report import parameter_cells
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listing, percent, seconds, significant
 from omnibench.robot.kinematics import Array, relative_deviations
 from omnibench.words import plural
@@ -229,16 +230,10 @@ def parameter_table(view: views.DatasetView) -> Iterator[Table]:
     by_name: dict[str, dict[str, Cell]] = {}
     for label, record in fitted.items():
         for each in record.parameters or ():
-            share, turned = each.deviation_percent, each.unit == "rad"
-            note = "design is 0" if share is None else f"{fixed(share, 2, signed=True)} %"
-            if turned:  # an angle's zero is a convention, so that no share of it means anything
-                note = f"{fixed(math.degrees(each.deviation), 3, signed=True)}°"
-            design, value = (
-                f"{fixed(math.degrees(number), 3)}°" if turned else f"{fixed(number, 5)} {each.unit}"
-                for number in (each.design, each.value)
-            )
-            mark = bound_marks(record).get(each.name, "")
-            by_name.setdefault(each.name, {"": Cell(design)})[label] = Cell(f"{value} {mark}".strip(), note)
+            design, value, unit, change, _ = parameter_cells(each)
+            shown = numbers.typeset(f"{value} {unit}"), bound_marks(record).get(each.name, "")
+            of_labels = by_name.setdefault(each.name, {"": Cell(numbers.typeset(f"{design} {unit}"))})
+            of_labels[label] = Cell(" ".join(shown).strip(), numbers.typeset(change))
     rows = [Row.of(name, *(of.get(label, NOTHING) for label in ("", *fitted))) for name, of in by_name.items()]
     if rows:
         yield Table(
@@ -313,7 +308,7 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
     errors = (Column("Position", "mm", priority=1), Column("Heading", "°", priority=1))
     ends = (Column("Verdict", numeric=False), Column("Time", priority=2))
     found_column = Column("What it found", numeric=False, priority=3)
-    columns = with_names("Method", "Cost", "of the design's", *errors, *ends, found_column)
+    columns = blocks.columns("Method", "Cost", "of the design's", *errors, *ends, found_column)
     note = (
         f"Mean final errors, Eq. (6); {runs} of {plural(cell.pairs.sessions, 'session')} judge {folds}{unit}. "
         f"Intervals are of this cell; verdicts hold for each method in {plural(judged, 'cell')} together."
