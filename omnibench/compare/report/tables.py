@@ -280,7 +280,7 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
     rows, unit = [], ""
     for number, each in enumerate(in_order):
         name = Cell(each.method, "" if each.family == "other" else each.family)
-        ratio = cell.against_design(each.method, judged)
+        ratio = cell.ratio(each.method, cells=judged)
         if ratio is None:
             rows.append(Row.of(name, *[NOTHING] * 4, each.status, NOTHING, each.reason, role="failed"))
             continue
