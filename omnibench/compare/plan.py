@@ -400,13 +400,12 @@ def plan_fits(config: CompareConfig, robots: Sequence[ComparedRobot]) -> list[Pl
     regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
     fits = [fit for robot in robots for name in regimes for fit in _of_robot(config, robot, name, regimes[name])]
     # Two entries may differ by their box alone, which their labels then name
-    for robot in robots:
-        labels: dict[str, CalibratorEntry] = {}
-        for fit in fits:
-            if fit.robot is robot and labels.setdefault(fit.label, fit.entry) is not fit.entry:
-                raise ConfigError(
-                    f"config {config.name}: two entries are called {fit.label!r}; give one a label of its own"
-                )
+    labels: dict[tuple[str, str], CalibratorEntry] = {}
+    for fit in fits:
+        if labels.setdefault((fit.robot.name, fit.label), fit.entry) is not fit.entry:
+            raise ConfigError(
+                f"config {config.name}: two entries are called {fit.label!r}; give one a label of its own"
+            )
     return fits
 
 
