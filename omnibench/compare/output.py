@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import partial
 from itertools import chain, count
@@ -16,21 +17,17 @@ import polars as pl
 
 from omnibench import files as disk
 from omnibench.compare.config import THEORETICAL_NAME, CompareConfig
-from omnibench.compare.result import (
-    Cell,
-    ComparisonResult,
-    EntryStatistics,
-    MethodInCell,
-    RunRecord,
-    ScoredFit,
-    TypicalAnswer,
-)
+from omnibench.compare.result import Cell, ComparisonResult, EntryStatistics, MethodInCell, RunRecord, ScoredFit
 from omnibench.config import read_yaml, to_json, to_yaml
 from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import calibration_of_fit
 from omnibench.fit.intervals import Interval
+from omnibench.fit.prior import mount_is_fitted
+from omnibench.fit.uncertainty import NoCovarianceError, physical_parameters, uncertainty_of
+from omnibench.registry import calibrators
 from omnibench.robot.calibration import Calibration, ModelExtension, Row, covariance_rows, write_calibration
+from omnibench.robot.physical import PhysicalParameter
 
 # First line of config.yaml in a folder of results. A folder whose config.yaml lacks it is not written to.
 _MARK = "# The effective config of a {}; the results beside it were made with it."
@@ -187,8 +184,18 @@ def calibration_of(run: ScoredFit, result: ComparisonResult) -> Calibration:
     """The calibration file of a run with an answer."""
     dataset: Dataset = result.datasets[run.record.dataset]
     assert run.matrix is not None  # only runs with an answer are written
-    answer = result.typical.get((run.record.dataset, run.record.label)) or TypicalAnswer(None, ())
-    uncertainty = answer.uncertainty
+    # How sure the answer is, and what it means
+    uncertainty, parameters = None, dict[str, PhysicalParameter]()
+    if run.result.vector is not None:
+        problem, settings, cls = run.fit.problem(), run.fit.settings, calibrators.entry(run.fit.settings.calibrator).cls
+        if cls.fitted:
+            with suppress(NoCovarianceError):  # it is no minimum
+                uncertainty = uncertainty_of(problem, run.result)
+        effects = run.result.extension.effects if run.result.extension else ()
+        asked = None if cls.as_is else settings.mount  # of which an answer that stands as it is knows nothing
+        fitted = mount_is_fitted(dataset.robot, asked, by_prior=cls.weighs_design and settings.tolerance is None)
+        reading = physical_parameters(problem, run.result, uncertainty, effects, fitted_mount=fitted)
+        parameters = {each.name: each for each in reading.parameters}
     covariance = covariance_rows(uncertainty.covariance) if uncertainty else None
     extension = run.result.extension or ModelExtension(effects=(), covariance=covariance)
     of_record = {"calibrator", "options", "seed", "box", "outcome", "reason"}
@@ -207,7 +214,7 @@ def calibration_of(run: ScoredFit, result: ComparisonResult) -> Calibration:
         provenance,
         integration=result.config.integration,
         noise=uncertainty.noise if uncertainty else run.result.noise if run.result.extension else None,
-        parameters={each.name: each for each in answer.parameters},
+        parameters=parameters,
         **dict(extension),
     )
 
@@ -261,7 +268,7 @@ def cell_table(result: ComparisonResult) -> pl.DataFrame:
 
 
 def _cell_row(result: ComparisonResult, cell: Cell, method: MethodInCell) -> dict[str, Any]:
-    ratio = cell.against_design(method.method, len(result.judged_cells))
+    ratio = cell.ratio(method.method, cells=len(result.judged_cells))
     heading = method.mean("heading")
     return asdict(cell.key) | {
         "simulated": result.datasets[cell.key.robot].simulated, "method": method.method, "family": method.family,

@@ -18,14 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.compare.config import (
-    AS_RECORDED,
-    CalibratorEntry,
-    CompareConfig,
-    RegimeChoice,
-    RobotChoice,
-    TrainingChoice,
-)
+from omnibench.compare import config as choices
+from omnibench.compare.config import AS_RECORDED, CalibratorEntry, CompareConfig, RegimeChoice
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory
 from omnibench.data.splits import repetitions, training_split
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError, nearest
@@ -37,19 +31,14 @@ from omnibench.fit.settings import CompleteSettings
 from omnibench.jobs.job import code_digest, content_key
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
-from omnibench.robot.kinematics import Array, Robot, interpolated
+from omnibench.robot.kinematics import Robot, interpolated
 from omnibench.words import plural
 
 _PACKAGE = Path(__file__).parents[1]
 # Files that every run depends on; ** takes in subfolders.
 _SHARED = (
-    "robot/**/*.py",
-    "fit/**/*.py",
-    "data/dataset.py",
-    "data/references.py",
-    "data/parquet.py",
-    "data/stored.py",
-    "compare/plan.py",
+    *("robot/**/*.py", "fit/**/*.py", "compare/plan.py"),
+    *("data/dataset.py", "data/references.py", "data/parquet.py", "data/stored.py"),
 )
 _CALIBRATORS = "fit/calibrators/*.py"
 _NO_PART = "check/*.py"  # judges recordings before they are fitted
@@ -68,11 +57,18 @@ def fit_key(settings: CompleteSettings, dataset: Dataset) -> str:
     classes.append(costs.entry(settings.cost.name).cls)
     modules = {sys.modules.get(base.__module__) for cls in classes for base in cls.__mro__}
     digest = hashlib.sha256()
+    # What a calibrator says that it uses: a file or a room of the package, as discover, or another package
     for name in sorted({name for cls in classes for name in getattr(cls, "uses", ())}):
-        digest.update(_code_of(name).encode())
+        place = _PACKAGE / name
+        files = set(place.rglob("*.py")) if place.is_dir() else {place} if place.is_file() else set()
+        try:
+            used = code_digest(_PACKAGE, files) if files else version(name)
+        except PackageNotFoundError:
+            used = "not installed"
+        digest.update(used.encode())
     for file in sorted({file for module in modules if (file := getattr(module, "__file__", None))}):
         digest.update(hashlib.sha256(Path(file).read_bytes()).digest())
-    code = digest.hexdigest() + _shared_code()
+    code = digest.hexdigest() + _shared_code(_PACKAGE)
     return content_key({"data": dataset.hash, "settings": settings, "code": code})
 
 
@@ -85,22 +81,7 @@ def shared_code(package: Path) -> str:
     return code_digest(package, files)
 
 
-@cache
-def _shared_code() -> str:
-    return shared_code(_PACKAGE)
-
-
-def _code_of(name: str) -> str:
-    """Hash of a file or a room of the package, as ``discover``; the version of another package."""
-    place = _PACKAGE / name
-    if place.is_dir():
-        return code_digest(_PACKAGE, set(place.rglob("*.py")))
-    if place.is_file():
-        return code_digest(_PACKAGE, {place})
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
+_shared_code = cache(shared_code)
 
 
 # ``box_name`` of a calibrator whose answer does not depend on a box.
@@ -134,7 +115,11 @@ def in_regime(runs: Sequence[Trajectory], regime: RegimeChoice, seed: int) -> tu
 
 
 def _worsened(run: Trajectory, regime: RegimeChoice, seed: int) -> Trajectory:
-    poses = _late(run, regime, _chance(run, seed, "clock"))
+    poses = run.poses
+    if regime.clock_offset or regime.clock_drift:  # what is stamped t was taken at t - (offset + drift t)
+        offset, drift = _chance(run, seed, "clock").normal(0.0, [regime.clock_offset, regime.clock_drift])
+        taken = np.clip(run.pose_times - offset - drift * run.pose_times, 0.0, run.pose_times[-1])
+        poses = interpolated(taken, run.pose_times, run.poses)
     rng = _chance(run, seed, "noise")
     deviations = [regime.noise_position, regime.noise_position, math.radians(regime.noise_heading_deg)]
     if any(deviations):
@@ -146,15 +131,6 @@ def _worsened(run: Trajectory, regime: RegimeChoice, seed: int) -> Trajectory:
         away = regime.outlier_size * np.column_stack([np.cos(directions), np.sin(directions)])
         poses = poses + np.where(far[:, None], np.column_stack([away, np.zeros(len(poses))]), 0.0)
     return run if poses is run.poses else replace(run, poses=poses)
-
-
-def _late(run: Trajectory, regime: RegimeChoice, rng: np.random.Generator) -> Array:
-    """Poses (K, 3) whose stamps t are late: each was taken at t - (offset + drift t)."""
-    if not (regime.clock_offset or regime.clock_drift):
-        return run.poses
-    offset, drift = rng.normal(0.0, [regime.clock_offset, regime.clock_drift])
-    taken = np.clip(run.pose_times - offset - drift * run.pose_times, 0.0, run.pose_times[-1])
-    return interpolated(taken, run.pose_times, run.poses)
 
 
 def _chance(run: Trajectory, seed: int, what: str) -> np.random.Generator:
@@ -193,20 +169,28 @@ class Training:
         """The kinds that it is judged on, in the order of the folds."""
         return tuple(dict.fromkeys(kind for fold in self.folds for kind, runs in fold.judged.items() if runs))
 
-    @property
-    def fitted_kinds(self) -> tuple[str, ...]:
-        """The kinds of whose training errors are known."""
-        return tuple(dict.fromkeys(kind for fold in self.folds for kind in fold.fitted or ()))
 
-
-def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice], place: str) -> tuple[Training, ...]:
+def divide(
+    dataset: Dataset, robot: choices.RobotChoice, rules: Sequence[choices.TrainingChoice], place: str
+) -> tuple[Training, ...]:
     """The trainings of a robot's runs; those that nothing judges are left out.
 
     place: what messages begin with. ConfigError: a run is of two kinds, a rule names an unknown kind, or two rules give
     the same training. DataError: no run is of a kind, or names its session, or is left to judge by.
     """
     runs = dataset.trajectories
-    of_kind = _indices_by_kind(runs, robot.kinds, place)
+    # Indices of the runs by kind, in the order of the kinds' first runs
+    of_kind: dict[str, list[int]] = {} if robot.kinds else {ONE_KIND: list(range(len(runs)))}
+    for index, run in enumerate(runs):
+        mine = [kind for kind, patterns in robot.kinds.items() if _named(run.id, patterns)]
+        if len(mine) > 1:
+            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(mine)}; make the patterns differ")
+        for kind in mine:
+            of_kind.setdefault(kind, []).append(index)
+    for kind, patterns in robot.kinds.items():
+        if kind not in of_kind:
+            found = ", ".join(run.id for run in runs[:4])
+            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
     trainings: dict[str, Training] = {}
     for rule in rules:
         for kind in rule.kinds:
@@ -228,28 +212,11 @@ def divide(dataset: Dataset, robot: RobotChoice, rules: Sequence[TrainingChoice]
     return tuple(trainings.values())
 
 
-_ByKind = Mapping[str, Sequence[int]]  # indices of runs by kind, in the order of the kinds' first runs
-
-
-def _indices_by_kind(runs: Sequence[Trajectory], kinds: Mapping[str, Sequence[str]], place: str) -> _ByKind:
-    if not kinds:
-        return {ONE_KIND: range(len(runs))}
-    of_kind: dict[str, list[int]] = {}
-    for index, run in enumerate(runs):
-        mine = [kind for kind, patterns in kinds.items() if any(fnmatchcase(run.id, each) for each in patterns)]
-        if len(mine) > 1:
-            raise ConfigError(f"{place}: run {run.id} is of kinds {' and '.join(mine)}; make the patterns differ")
-        for kind in mine:
-            of_kind.setdefault(kind, []).append(index)
-    for kind, patterns in kinds.items():
-        if kind not in of_kind:
-            found = ", ".join(run.id for run in runs[:4])
-            raise DataError(f"{place}: no run is of kind {kind} ({', '.join(patterns)}); runs are: {found}, ...")
-    return of_kind
+_ByKind = Mapping[str, Sequence[int]]  # indices of runs by kind
 
 
 def _divisions(
-    runs: Sequence[Trajectory], of_kind: _ByKind, rule: TrainingChoice
+    runs: Sequence[Trajectory], of_kind: _ByKind, rule: choices.TrainingChoice
 ) -> Iterator[tuple[str, Sequence[Fold]]]:
     """The trainings of a rule, by name, with their folds."""
     everything = sorted(index for indices in of_kind.values() for index in indices)
@@ -431,17 +398,14 @@ def plan_fits(config: CompareConfig, robots: Sequence[ComparedRobot]) -> list[Pl
                     f"{', '.join(names) or 'none'}"
                 )
     regimes = {AS_RECORDED: RegimeChoice(), **config.regimes}
-    fits = [
-        fit for robot in robots for name, regime in regimes.items() for fit in _of_robot(config, robot, name, regime)
-    ]
+    fits = [fit for robot in robots for name in regimes for fit in _of_robot(config, robot, name, regimes[name])]
     # Two entries may differ by their box alone, which their labels then name
-    for robot in robots:
-        labels: dict[str, CalibratorEntry] = {}
-        for fit in fits:
-            if fit.robot is robot and labels.setdefault(fit.label, fit.entry) is not fit.entry:
-                raise ConfigError(
-                    f"config {config.name}: two entries are called {fit.label!r}; give one a label of its own"
-                )
+    labels: dict[tuple[str, str], CalibratorEntry] = {}
+    for fit in fits:
+        if labels.setdefault((fit.robot.name, fit.label), fit.entry) is not fit.entry:
+            raise ConfigError(
+                f"config {config.name}: two entries are called {fit.label!r}; give one a label of its own"
+            )
     return fits
 
 

@@ -20,7 +20,6 @@ from omnibench.environment import Environment
 from omnibench.fit.calibrator import Outcome, RunResult
 from omnibench.fit.intervals import Clusters, Interval
 from omnibench.fit.parameterisation import ParameterisationName
-from omnibench.fit.uncertainty import Uncertainty
 from omnibench.registry import calibrators
 from omnibench.robot.calibration import HeldOutVerdict, Row
 from omnibench.robot.kinematics import Array
@@ -181,17 +180,6 @@ class EntryVerdict:
     verdict: HeldOutVerdict
 
 
-@dataclass(frozen=True, eq=False)
-class TypicalAnswer:
-    """The answer of an entry's typical run.
-
-    uncertainty: None where it is no minimum, or is not fitted. parameters: the physical ones that it means.
-    """
-
-    uncertainty: Uncertainty | None
-    parameters: tuple[PhysicalParameter, ...]
-
-
 Measure = Literal["cost", "position", "heading"]
 MEASURES: tuple[Measure, ...] = ("cost", "position", "heading")
 
@@ -264,20 +252,17 @@ class Cell:
 
     def share(self, method: str) -> float | None:
         """A method's mean error, Eq. (6), as a share of the design values'; None without an answer."""
-        ratio = self.against_design(method, 1)
+        ratio = self.ratio(method)
         return None if ratio is None else ratio.value
 
-    def against_design(self, method: str, cells: int) -> CellRatio | None:
-        """A method's mean error, Eq. (6), as a ratio to the design values'; None without an answer."""
-        errors = self.methods[method].errors if method in self.methods else None
-        return None if errors is None else cell_ratio(errors["cost"], self.design["cost"], self.pairs, cells)
+    def ratio(self, method: str, other: str = "", cells: int = 1) -> CellRatio | None:
+        """A method's mean error, Eq. (6), as a ratio to another's, or to the design values'; None without an answer.
 
-    def between(self, method: str, other: str, cells: int) -> CellRatio | None:
-        """The ratio of two methods' mean errors, Eq. (6); None where one has no answer."""
-        one, two = self.methods[method].errors, self.methods[other].errors
-        if one is None or two is None:
-            return None
-        return cell_ratio(one["cost"], two["cost"], self.pairs, cells)
+        cells: how many are judged together.
+        """
+        one = self.methods[method].errors if method in self.methods else None
+        two = self.methods[other].errors if other else self.design
+        return None if one is None or two is None else cell_ratio(one["cost"], two["cost"], self.pairs, cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +279,7 @@ class ComparisonResult(Shown):
     """Everything that the report shows.
 
     broken: why recordings could not be read, by robot. Of data sets alone: statistics of every entry; design_costs,
-    mean cost of the design values, by data set and split; typical, of the entries' typical runs, by data set and label;
+    mean cost of the design values, by data set and split;
     held_out, the verdict on the best calibration of each that has one; sessions, sentences on those that differ from
     the others or could not be compared.
     """
@@ -308,7 +293,6 @@ class ComparisonResult(Shown):
     statistics: tuple[EntryStatistics, ...]
     design_costs: Mapping[str, Mapping[Split, Interval]]
     certificates: tuple[BoxCertificate, ...]
-    typical: Mapping[tuple[str, str], TypicalAnswer]
     held_out: Mapping[str, EntryVerdict]
     sessions: Mapping[str, tuple[str, ...]]
     environment: Environment
@@ -356,7 +340,7 @@ class ComparisonResult(Shown):
                 compared.append((cell, min(published, key=lambda each: each.mean("cost") or 0.0).method))
         found = []
         for cell, best in compared:
-            ratio = cell.between(name, best, len(compared))
+            ratio = cell.ratio(name, best, len(compared))
             assert ratio is not None  # both have answers
             found.append(AgainstBest(cell, best, ratio))
         return tuple(found)

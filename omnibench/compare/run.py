@@ -18,7 +18,7 @@ from omnibench.compare.output import check_output, prepare_output, write_results
 from omnibench.compare.plan import UNBOUNDED, ComparedRobot, FitTask, PlannedFit, load_robots, plan_fits
 from omnibench.compare.report.comparison_view import ComparisonView
 from omnibench.compare.result import ComparisonResult, ScoredFit
-from omnibench.compare.score import certify, score_fits, typical_answers
+from omnibench.compare.score import certify, score_fits
 from omnibench.compare.statistics import design_costs, entry_statistics, held_out_verdicts, is_mean, make_cells
 from omnibench.environment import environment
 from omnibench.errors import ConfigError, DataError, Interrupted, UnknownNameError, require_type
@@ -162,8 +162,7 @@ class _Runs(JobWatch[RunResult]):
     def _result(self, number: int, failure: Failure) -> RunResult:
         """The result of a run that left none. DataError: the disk refused it."""
         if isinstance(failure.error, _RunFailed):
-            result: RunResult = failure.error.args[0]
-            return result
+            return failure.error.args[0]
         if isinstance(failure.error, DataError):
             raise failure.error
         run, now = self._plan[number], time.monotonic()
@@ -262,7 +261,6 @@ def assess(
         statistics=statistics,
         design_costs=design_costs(of_datasets, config.bootstrap),
         certificates=certificates,
-        typical=typical_answers(of_datasets, statistics),
         held_out=held_out_verdicts(statistics, datasets, config.bootstrap),
         sessions={name: (*compared.sentences, *compared.doubts) for name, compared in sessions.items()},
         environment=environment(),

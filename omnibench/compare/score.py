@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from omnibench.compare.config import CertificateChoice, CompareConfig
 from omnibench.compare.plan import PlannedFit
-from omnibench.compare.result import BoxCertificate, EntryStatistics, RunRecord, ScoredFit, SplitScore, TypicalAnswer
+from omnibench.compare.result import BoxCertificate, RunRecord, ScoredFit, SplitScore
 from omnibench.data.dataset import SPLITS, Split, Trajectory
 from omnibench.errors import OmnibenchError, PluginError
 from omnibench.fit.calibrator import Outcome, RunResult, describe_error
@@ -21,10 +20,8 @@ from omnibench.fit.evaluate import final_errors, positions_and_headings
 from omnibench.fit.geometry import WheelGeometry, searched_parameters
 from omnibench.fit.intervals import UnitName, units_of
 from omnibench.fit.parameterisation import make_bounds
-from omnibench.fit.prior import mount_is_fitted
 from omnibench.fit.reference_rows import with_mean_errors
 from omnibench.fit.settings import CostChoice
-from omnibench.fit.uncertainty import NoCovarianceError, physical_parameters, uncertainty_of
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.registry import calibrators, costs
 from omnibench.robot.calibration import extended_model, matrix_rows
@@ -98,10 +95,7 @@ class SplitScorer:
 
 
 def score_fits(
-    config: CompareConfig,
-    fits: Sequence[PlannedFit],
-    results: Sequence[RunResult],
-    progress: Reporter = no_progress,
+    config: CompareConfig, fits: Sequence[PlannedFit], results: Sequence[RunResult], progress: Reporter = no_progress
 ) -> tuple[tuple[ScoredFit, ...], dict[str, Array]]:
     """Every fit with its errors, and by robot the errors (Z, 3) of the design values on all its runs.
 
@@ -110,6 +104,7 @@ def score_fits(
     """
     scored: dict[int, ScoredFit] = {}
     designs: dict[str, Array] = {}
+    no_answer: dict[str, Any] = {"vector": None, "matrix": None, "cost": None}
     for robot in {fit.robot.name: fit.robot for fit in fits}.values():
         progress(Progress("judging", len(scored), len(fits), "answer"))
         dataset, runs, choice = robot.dataset, robot.dataset.trajectories, config.cost or CostChoice()
@@ -140,10 +135,10 @@ def score_fits(
             except OmnibenchError as error:
                 if isinstance(error, PluginError) and config.datasets:  # its cost
                     raise
-                result, of_fit = _without_answer(result, Outcome.FAILED, str(error)), None
+                result, of_fit = replace(result, outcome=Outcome.FAILED, reason=str(error), **no_answer), None
             if of_fit is not None and not np.isfinite(of_fit).all() and config.robots:
-                result = _without_answer(result, Outcome.INVALID, "its odometry is not finite on a run that judges it")
-                of_fit = None
+                why = "its odometry is not finite on a run that judges it"
+                result, of_fit = replace(result, outcome=Outcome.INVALID, reason=why, **no_answer), None
             record = _record(fit, result, scores, design) if config.datasets else None
             scored[index] = ScoredFit(fit, result, of_fit, record, scores, design)
     progress(Progress("judging", len(fits), len(fits), "answer"))
@@ -164,10 +159,6 @@ def score_fits(
             gap = {"gap": done.row.train_cost / known[1] - 1, "gap_box": known[0]}
             in_order[index] = replace(done, row=done.row.model_copy(update=gap))
     return tuple(in_order), designs
-
-
-def _without_answer(result: RunResult, outcome: Outcome, reason: str) -> RunResult:
-    return replace(result, outcome=outcome, reason=reason, vector=None, matrix=None, cost=None)
 
 
 def known_of_box(done: ScoredFit, others: Iterable[tuple[PlannedFit, T]]) -> T | None:
@@ -280,26 +271,3 @@ def certify(
             done = replace(done, row=done.row.model_copy(update={"proven_gap": gap}))
         proven.append(done)
     return tuple(proven), tuple(proof for _, proof in proofs)
-
-
-def typical_answers(
-    scored: Sequence[ScoredFit], statistics: Sequence[EntryStatistics]
-) -> dict[tuple[str, str], TypicalAnswer]:
-    """How sure the answer of every entry's typical run is, and what it means, by data set and label."""
-    typical = [entry.typical for entry in statistics]
-    answers = {}
-    for done in scored:
-        fit, result = done.fit, done.result
-        if result.vector is None or not any(done is one for one in typical):
-            continue
-        problem, uncertainty, cls = fit.problem(), None, calibrators.entry(fit.settings.calibrator).cls
-        if cls.fitted:
-            with suppress(NoCovarianceError):  # its answer is no minimum
-                uncertainty = uncertainty_of(problem, result)
-        effects = result.extension.effects if result.extension else ()
-        asked = None if cls.as_is else fit.settings.mount  # of which an answer that stands as it is knows nothing
-        by_prior = cls.weighs_design and fit.settings.tolerance is None
-        fitted_mount = mount_is_fitted(fit.dataset.robot, asked, by_prior=by_prior)
-        reading = physical_parameters(problem, result, uncertainty, effects, fitted_mount=fitted_mount)
-        answers[fit.robot.name, fit.label] = TypicalAnswer(uncertainty, reading.parameters)
-    return answers

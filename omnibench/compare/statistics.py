@@ -25,20 +25,11 @@ from operator import itemgetter
 import numpy as np
 from scipy.stats import friedmanchisquare, rankdata, studentized_range
 
+from omnibench.compare import result as results
 from omnibench.compare.config import AS_RECORDED
 from omnibench.compare.plan import Fold
 from omnibench.compare.ratios import Pairs
-from omnibench.compare.result import (
-    MEASURES,
-    Cell,
-    CellKey,
-    EntryStatistics,
-    EntryVerdict,
-    Measure,
-    MethodInCell,
-    ScoredFit,
-    SplitScore,
-)
+from omnibench.compare.result import Cell, EntryStatistics, Measure, ScoredFit, SplitScore
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.evaluate import judge, nothing_held_out
 from omnibench.fit.intervals import Bootstrap, Interval, RatioIntervals
@@ -61,7 +52,12 @@ def entry_statistics(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> tuple[E
     groups: dict[tuple[str, str], list[ScoredFit]] = {}
     for run in runs:
         groups.setdefault((run.record.dataset, run.record.label), []).append(run)
-    typical = {key: _typical(group) for key, group in groups.items()}
+    # The run of median training cost (the worse one of two), of those with an answer
+    typical: dict[tuple[str, str], ScoredFit | None] = {}
+    for key, group in groups.items():
+        answered = [run for run in group if run.record.train_cost is not None]
+        ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
+        typical[key] = ranked[len(ranked) // 2] if ranked else None
     intervals = RatioIntervals(bootstrap)
     statistics = []
     for (dataset, label), group in groups.items():
@@ -122,7 +118,7 @@ def design_costs(runs: Sequence[ScoredFit], bootstrap: Bootstrap) -> dict[str, d
 
 def held_out_verdicts(
     statistics: Sequence[EntryStatistics], datasets: Mapping[str, Dataset], bootstrap: Bootstrap
-) -> dict[str, EntryVerdict]:
+) -> dict[str, results.EntryVerdict]:
     """The verdict of each data set's validation runs on its best calibration, if a calibrator gave an answer.
 
     The best calibration is the best entry, or, where that is not fitted, the fitted one of lowest judged cost.
@@ -139,7 +135,7 @@ def held_out_verdicts(
             verdict, held_out = nothing_held_out(), dataset.split("validation")
             if held_out:
                 verdict = judge(run.design["validation"].errors, run.scores["validation"].errors, held_out, bootstrap)
-            verdicts[name] = EntryVerdict(label, verdict)
+            verdicts[name] = results.EntryVerdict(label, verdict)
     return verdicts
 
 
@@ -158,13 +154,6 @@ def _best(competing: Sequence[ScoredFit], intervals: RatioIntervals) -> ScoredFi
     return min(rivals, key=lambda run: (run.record.train_cost or 0.0, _judged_cost(run)))
 
 
-def _typical(group: Sequence[ScoredFit]) -> ScoredFit | None:
-    """The run of median training cost (the worse one of two), of those with an answer."""
-    answered = [run for run in group if run.record.train_cost is not None]
-    ranked = sorted(answered, key=lambda run: (run.record.train_cost, run.record.seed))
-    return ranked[len(ranked) // 2] if ranked else None
-
-
 def _judged(run: ScoredFit) -> SplitScore:
     """The score that an answer is judged by: on the validation split where there is one."""
     return run.scores["validation" if "validation" in run.scores else "train"]
@@ -180,14 +169,10 @@ def _against_best(run: ScoredFit, best: ScoredFit, intervals: RatioIntervals) ->
     difference = intervals.difference(score.costs - of_best.costs, score.units)
     if difference.known is None:
         return difference, True if run is best else None
-    negligible = NEGLIGIBLE_SHARE * _standard_error(of_best)
-    return difference, bool(difference.holds(0.0) or abs(difference.value) <= negligible)
-
-
-def _standard_error(score: SplitScore) -> float:
-    """The standard error of a mean cost by the sums over its units."""
-    left = score.units.sums(score.costs - score.costs.mean())
-    return float(np.sqrt(len(left) / (len(left) - 1) * np.square(left).sum()) / len(score.costs))
+    # The standard error of the best mean cost by the sums over its units
+    left = of_best.units.sums(of_best.costs - of_best.costs.mean())
+    deviation = float(np.sqrt(len(left) / (len(left) - 1) * np.square(left).sum()) / len(of_best.costs))
+    return difference, bool(difference.holds(0.0) or abs(difference.value) <= NEGLIGIBLE_SHARE * deviation)
 
 
 def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tuple[Cell, ...]:
@@ -204,7 +189,8 @@ def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tupl
         methods = {name: _method(name, fits) for name, fits in of_methods.items()}
         errors = {name: _by_seeds(fits, folds, designs) for name, fits in of_methods.items()}
         places = [(kind, False) for kind in fit.training.kinds]
-        places += [(kind, True) for kind in fit.training.fitted_kinds if regime == AS_RECORDED]
+        trained = dict.fromkeys(kind for fold in folds for kind in fold.fitted or ())
+        places += [(kind, True) for kind in trained if regime == AS_RECORDED]
         for kind, fitted in places:
             listed = [
                 (number, index)
@@ -217,9 +203,9 @@ def make_cells(judged: Sequence[ScoredFit], design: Mapping[str, Array]) -> tupl
             in_cell = {}
             for name, method in methods.items():
                 measured = [_measured(of_seed, pairs) for of_seed in errors[name]]
-                means = {measure: np.mean([of[measure] for of in measured], axis=0) for measure in MEASURES}
+                means = {name: np.mean([of[name] for of in measured], axis=0) for name in results.MEASURES}
                 in_cell[name] = replace(method, errors=means) if method.answers else method
-            key = CellKey(robot, training_name, regime, kind, fitted)
+            key = results.CellKey(robot, training_name, regime, kind, fitted)
             cells.append(Cell(key, pairs, _measured(designs, pairs), in_cell))
     return tuple(cells)
 
@@ -234,11 +220,11 @@ def _by_seeds(fits: Sequence[ScoredFit], folds: Sequence[Fold], designs: Array) 
     return list(of_seeds.values())
 
 
-def _method(name: str, fits: Sequence[ScoredFit]) -> MethodInCell:
+def _method(name: str, fits: Sequence[ScoredFit]) -> results.MethodInCell:
     """A method in all cells of its fits, without their errors."""
     answered = [each for each in fits if each.errors is not None]
     asked = [each.fit.settings for each in fits if not each.fit.refusal]
-    return MethodInCell(
+    return results.MethodInCell(
         method=name,
         family=fits[0].fit.entry.family,
         fits=len(fits),

@@ -12,7 +12,7 @@ import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Dataset
 from omnibench.errors import ConfigError, DataError, require_type
 from omnibench.fit.calibrate import CalibrationRun
 from omnibench.fit.evaluate import Evaluation, ModelErrors, SplitErrors
@@ -146,12 +146,10 @@ class CalibrationResult(Result):
         return f"the design values are kept along {motions}, of which these data say nothing" if kept else ""
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
-        return {"matrix": self._matrix, "parameters": self._parameters}
-
-    def _parameters(self) -> pl.DataFrame:
-        schema = {"name": pl.String, "design": pl.Float64, "value": pl.Float64, "unit": pl.String}
+        numbers = dict.fromkeys(("design", "value", "low", "high"), pl.Float64)
+        schema = dict.fromkeys(("name", "design", "value", "unit"), pl.String) | numbers
         rows = [each.model_dump() for each in self.parameters.values()]
-        return pl.DataFrame(rows, {**schema, "low": pl.Float64, "high": pl.Float64})
+        return {"matrix": self._matrix, "parameters": lambda: pl.DataFrame(rows, schema)}
 
     def _matrix(self) -> pl.DataFrame:
         """Elements with their standard deviations by the covariance; of a run also with their 95 % intervals.
@@ -264,15 +262,12 @@ class EvaluationResult(Result):
 
     def frames(self) -> Mapping[str, Callable[[], pl.DataFrame]]:
         assert self.evaluation is not None
-        told = any(errors.references for errors in self.evaluation.splits.values())
-        return {"splits": self._splits, **({"references": self._references} if told else {})}
+        references = [labels | dict(at) for labels, errors in self._of_models() for at in errors.references]
+        return {"splits": self._splits, **({"references": lambda: pl.DataFrame(references)} if references else {})}
 
     def _splits(self) -> pl.DataFrame:
         rows = [labels | {name: vars(errors)[name] for name in _FINAL} for labels, errors in self._of_models()]
         return pl.DataFrame(rows, infer_schema_length=None)
-
-    def _references(self) -> pl.DataFrame:
-        return pl.DataFrame([labels | dict(at) for labels, errors in self._of_models() for at in errors.references])
 
     def _of_models(self) -> Iterator[tuple[dict[str, Any], SplitErrors]]:
         """The errors on every split with its name and the model's."""
@@ -355,7 +350,12 @@ def calibration_document(
     calibration, models = shown.calibration, _models(shown.calibration, dataset)
     errors = [ModelErrors.of(model, runs) for _, model in models]
     groups = {"all": runs} | {kind: [runs[index] for index in like] for kind, like in kinds_of(runs).items()}
-    rows = tuple(page.Row.of(name, *_error_cells(errors, group)) for name, group in groups.items())
+    rows = []
+    for name, group in groups.items():
+        both = [of_model.on(group) for of_model in errors]
+        places = (significant(None if each.position_mean_m is None else 1e3 * each.position_mean_m) for each in both)
+        turns = (None if each.heading_mean_rad is None else math.degrees(each.heading_mean_rad) for each in both)
+        rows.append(page.Row.of(name, str(len(group)), *places, *(fixed(turn, 2) for turn in turns)))
     _, _, *means = (cell.text for cell in rows[0].cells)
     tiles = [
         page.Fact(what, f"{before} → {after}{unit}", "mean error of the final pose")
@@ -369,7 +369,7 @@ def calibration_document(
         tiles.append(page.Fact("Change of the final error", percent(-verdict.improvement, signed=True), interval))
     headings = (f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS)
     of_motions = page.Table(
-        f"Mean errors of the final pose of the {which} runs", page.columns("motion", "runs", *headings), rows
+        f"Mean errors of the final pose of the {which} runs", page.columns("motion", "runs", *headings), tuple(rows)
     )
     sections = [page.Section("motions", "Errors by motion", (of_motions,))]
     if shown.parameters:
@@ -412,28 +412,24 @@ def calibration_document(
     )
 
 
-def _error_cells(errors: Sequence[ModelErrors], runs: Sequence[Trajectory]) -> list[str]:
-    """Number of runs, and the means of their final errors by each model: positions, mm, then headings, degrees."""
-    both = [of_model.on(runs) for of_model in errors]
-    places = (significant(None if each.position_mean_m is None else 1e3 * each.position_mean_m) for each in both)
-    turns = (None if each.heading_mean_rad is None else math.degrees(each.heading_mean_rad) for each in both)
-    return [str(len(runs)), *places, *(fixed(turn, 2) for turn in turns)]
-
-
 def parameter_table(calibration: Calibration, title: str = "parameter") -> page.Table:
     """The physical parameters beside the design: angles in degrees, and differences from the design in % or degrees."""
-    rows = []
-    for each in calibration.physical_parameters.values():
-        factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
-            each.unit, (1.0, 5, each.unit)
-        )
-        share = None if each.unit == "rad" else each.deviation_percent
-        change = f"{factor * each.deviation:+.{decimals}f} {unit}" if share is None else f"{share:+.2f} %"
-        ends = [] if each.low is None or each.high is None else [each.low, each.high]
-        interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or NOTHING
-        values = (f"{factor * value:.{decimals}f}" for value in (each.design, each.value))
-        rows.append((each.name, *values, unit, change, interval))
+    rows = [(each.name, *parameter_cells(each)) for each in calibration.physical_parameters.values()]
     return _values_table(title, rows)
+
+
+def parameter_cells(parameter: PhysicalParameter) -> tuple[str, str, str, str, str]:
+    """Design, value, their unit, the change and the interval of a parameter."""
+    factor, decimals, unit = {"rad": (math.degrees(1.0), 3, "deg"), "1": (1.0, 4, "")}.get(
+        parameter.unit, (1.0, 5, parameter.unit)
+    )
+    # An angle's zero is a convention, so that no share of it means anything
+    share = None if parameter.unit == "rad" else parameter.deviation_percent
+    change = f"{factor * parameter.deviation:+.{decimals}f} {unit}" if share is None else f"{share:+.2f} %"
+    ends = [] if parameter.low is None or parameter.high is None else [parameter.low, parameter.high]
+    interval = " to ".join(f"{factor * end:.{decimals}f}" for end in ends) or NOTHING
+    design, value = (f"{factor * each:.{decimals}f}" for each in (parameter.design, parameter.value))
+    return design, value, unit, change, interval
 
 
 def _values_table(heading: str, rows: Sequence[Sequence[str]], note: str = "") -> page.Table:
@@ -500,10 +496,7 @@ def path_table(errors: Sequence[PathError], calibration: Calibration) -> page.Ta
         places = (f"{_figures(1e3 * each.position_m)} ({_figures(1e3 * each.position_95_m)})" for each in both)
         turns = (f"{math.degrees(each.heading_rad):.2f} ({math.degrees(each.heading_95_rad):.2f})" for each in both)
         rows.append(page.Row.of(path, *places, *turns))
-    columns = page.columns(
-        "path",
-        *(f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS),
-    )
+    columns = page.columns("path", *(f"{what}, {model} ({unit})" for what, unit in _UNITS.items() for model in _MODELS))
     runs = "" if calibration.slip is None else f"; slip as of {plural(calibration.slip.runs, 'training run')}"
     return page.Table(f"errors to expect at a path's end (95 % lie within){runs}", columns, tuple(rows))
 

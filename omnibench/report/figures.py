@@ -80,11 +80,10 @@ def coordinates(values: Values) -> list[float | None]:
     if not 0 < span < np.inf:
         return [None if math.isnan(value) else value for value in numbers.tolist()]
     decimals = _DIGITS - math.floor(math.log10(span))
-    return [None if math.isnan(value) else _rounded(value, span, decimals) for value in numbers.tolist()]
-
-
-def _rounded(value: float, span: float, decimals: int) -> float:
-    return round(value, decimals) if abs(value) > span else float(f"{value:.{_DIGITS}g}")
+    return [
+        None if math.isnan(value) else round(value, decimals) if abs(value) > span else float(f"{value:.{_DIGITS}g}")
+        for value in numbers.tolist()
+    ]
 
 
 def _trace(
@@ -92,12 +91,8 @@ def _trace(
 ) -> go.Scatter:
     shown: dict[str, Any] = {"hovertemplate": f"{hover}<extra></extra>"} if hover else {"hoverinfo": "skip"}
     shown |= {"text": [text(each) for each in words]} if words else {}
-    return go.Scatter(**shown | {"x": _along(x), "y": _along(y), "legendgroup": item.key or None} | looks)
-
-
-def _along(values: Values) -> list[Any]:
-    names = [text(value) for value in values if isinstance(value, str)]
-    return names or coordinates(values)
+    along = ([text(value) for value in values if isinstance(value, str)] or coordinates(values) for values in (x, y))
+    return go.Scatter(**shown | dict(zip("xy", along, strict=True)) | {"legendgroup": item.key or None} | looks)
 
 
 _WIDTH = 0.15  # of a drawn wheel, as a share of its radius (chosen: the data do not hold it)

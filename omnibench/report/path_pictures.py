@@ -21,7 +21,7 @@ from omnibench.robot.model import OdometryModel
 DESIGN_ITEM = LegendItem("design", "design values", THEORETICAL, "dash")
 CALIBRATED = "#0072b2"
 Models = Sequence[tuple[LegendItem, OdometryModel]]
-_WIDTHS = (3.2, 1.8)  # px: before is seen behind after
+_BEFORE, _AFTER = 3.2, 1.8  # px: before is seen behind after
 _POINTS = 160  # points that a path is drawn with (chosen)
 _ENDS = 500  # ends that are drawn of each model (chosen: more cannot be told apart)
 _HEIGHT = 330  # px
@@ -44,11 +44,9 @@ def paths_before_after(runs: Sequence[Trajectory], models: Models, which: str) -
     ordered = sorted(seen or range(len(runs)), key=lambda index: gains[index])
     run = runs[ordered[(len(ordered) - 1) // 2]]
     title = motion_in_words(run.id, run.v, run.alpha, run.omega)
-    figures = (_path(f"{title[0].upper()}{title[1:]}", run, models), _all_ends(runs, ends, models, which))
-    caption = (
-        "The run whose error changes by the median. Circle: start; dots: ends. In the titles: distance of the end "
-    )
-    caption += "from the reference's, and turn between them, before and after."
+    figures = (path_picture(f"{title[0].upper()}{title[1:]}", run, models), _all_ends(runs, ends, models, which))
+    caption = "The run whose error changes by the median. Circle: start; dots: ends. In the titles: distance of the "
+    caption += "end from the reference's, and turn between them, before and after."
     items = (REFERENCE_ITEM, *(item for item, _ in models))
     return FigureGrid(figures, items, 2, caption, "paths-before-after")
 
@@ -60,14 +58,15 @@ def _final_errors(model: OdometryModel, runs: Sequence[Trajectory]) -> Array:
     return np.column_stack([along_starts, errors[:, 2]])
 
 
-def _path(title: str, run: Trajectory, models: Models) -> Figure:
+def path_picture(title: str, run: Trajectory, models: Models) -> Figure:
+    """The path of a run by the reference and by models; after the title the error of each at its end."""
     reference = run.poses[evenly(len(run.poses), 2 * _POINTS)]
     stamps = np.linspace(0.0, run.pose_times[-1], _POINTS)
     traces = [path(REFERENCE_ITEM, reference, 3.5), marks(REFERENCE_ITEM, 8, *reference[-1:, :2].T)]
     drawn, words = [reference[:, :2]], []
-    for (item, model), width in zip(models, _WIDTHS, strict=False):
+    for number, (item, model) in enumerate(models):
         (poses,) = model.reported([run.log(stamps)])
-        traces += [path(item, poses, width), marks(item, 8, *poses[-1:, :2].T)]
+        traces += [path(item, poses, _AFTER if number else _BEFORE), marks(item, 8, *poses[-1:, :2].T)]
         drawn.append(poses[:, :2])
         words.append(_error_in_words(_final_errors(model, [run])))
     traces.append(marks(START, 9, *run.start[None, :2].T, hover="start"))
@@ -103,8 +102,7 @@ def _compact(title: str, figure: go.Figure, description: str) -> Figure:
 def _window(points: Array, middle: Array) -> Array:
     """A square window (2, 2) about a middle that holds the points, with a margin."""
     reach = np.nanmax(np.abs(points - middle), initial=_LEAST_WINDOW / 2)
-    window: Array = middle[:, None] + 1.12 * float(reach) * np.array([[-1.0, 1.0]] * 2)
-    return window
+    return middle[:, None] + 1.12 * float(reach) * np.array([[-1.0, 1.0]] * 2)
 
 
 def _error_in_words(errors: Array) -> str:

@@ -25,19 +25,8 @@ from pydantic import BaseModel
 from omnibench.config import to_yaml
 from omnibench.environment import Environment, package_versions
 from omnibench.files import write_text
-from omnibench.report.blocks import (
-    Block,
-    Choice,
-    Code,
-    Details,
-    Document,
-    Fact,
-    Facts,
-    FigureGrid,
-    Paragraph,
-    Section,
-)
-from omnibench.words import plural
+from omnibench.report import blocks as page
+from omnibench.report.blocks import Block, Document, FigureGrid, Section
 
 _PLOT_OPTIONS = {
     "responsive": True,
@@ -92,9 +81,9 @@ def grids_of(document: Document) -> Iterator[tuple[tuple[str, ...], FigureGrid]]
         for block in blocks:
             if isinstance(block, FigureGrid):
                 yield titles, block
-            elif isinstance(block, Details):
+            elif isinstance(block, page.Details):
                 yield from of_blocks(block.blocks, (*titles, block.title))
-            elif isinstance(block, Choice):
+            elif isinstance(block, page.Choice):
                 for title, inner in block.options.items():
                     yield from of_blocks(inner, (*titles, title))
 
@@ -143,19 +132,19 @@ def _json(content: Any) -> Markup:
     return Markup(dense)
 
 
-def reproduction_section(config: BaseModel, settings: Sequence[Fact], environment: Environment) -> Section:
+def reproduction_section(config: BaseModel, settings: Sequence[page.Fact], environment: Environment) -> Section:
     """The section for an effective config, the settings that matter most, and the environment of the work."""
     facts = (
         *settings,
-        Fact("Python", environment.python),
-        Fact("Platform", environment.platform),
-        Fact("Processor", environment.processor or "not known", plural(environment.processors, "logical processor")),
-        Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
+        page.Fact("Python", environment.python),
+        page.Fact("Platform", environment.platform),
+        page.Fact("Processor", environment.processor or "not known", f"{environment.processors} logical processors"),
+        page.Fact("Versions", ", ".join(f"{name} {version}" for name, version in environment.versions.items())),
     )
     blocks = (
-        Paragraph("The effective config lies beside this report. From this folder:"),
-        Code("omnibench compare config.yaml -o again"),
-        Facts(facts),
-        Details("Effective config", (Code(to_yaml(config)),)),
+        page.Paragraph("The effective config lies beside this report. From this folder:"),
+        page.Code("omnibench compare config.yaml -o again"),
+        page.Facts(facts),
+        page.Details("Effective config", (page.Code(to_yaml(config)),)),
     )
     return Section("reproduction", "How to reproduce", blocks, about="Config, versions and machine.", folded=True)

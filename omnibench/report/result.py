@@ -108,9 +108,8 @@ def with_next_step(document: Document, step: NextStep) -> Document:
 def frame_table(frame: pl.DataFrame) -> Table:
     """The head of a data frame as a table."""
     columns = tuple(Column(name, numeric=dtype.is_numeric()) for name, dtype in frame.schema.items())
-    rows = tuple(Row.of(*map(_cell, row)) for row in frame.head(_ROWS).iter_rows())
+    rows = tuple(
+        Row.of(*("" if each is None else f"{each:.6g}" if isinstance(each, float) else str(each) for each in row))
+        for row in frame.head(_ROWS).iter_rows()
+    )
     return Table("", columns, rows, f"the first {_ROWS} of {len(frame):,} rows" if len(frame) > _ROWS else "")
-
-
-def _cell(value: Any) -> str:
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

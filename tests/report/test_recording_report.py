@@ -31,7 +31,7 @@ from omnibench.report.recording.recording_figures import (
     scan_points,
     wheel_rates,
 )
-from omnibench.report.recording.section import has_recording, player, recording_document, recording_section
+from omnibench.report.recording.section import player, recording_document
 from omnibench.report.render import write_document
 from omnibench.robot.kinematics import Robot, Wheel
 from omnibench.robot.model import OdometryModel
@@ -198,14 +198,6 @@ def test_long_runs_with_many_scans_stay_below_two_megabytes(tmp_path: Path) -> N
     truth = {run.id: long.truth[run.id.rsplit("-", 1)[0]] for run in many}
     told = page(replace(long.dataset, trajectories=many, scans=found), tmp_path, truth=truth)
     assert len(told.html.encode()) < 2e6
-
-
-def test_more_than_wheels_and_poses_makes_a_section_for_other_reports(made: Sample) -> None:
-    assert has_recording(made.dataset)
-    assert not has_recording(bare(made.dataset))
-    pictures, contents = recording_section(made.dataset).blocks
-    assert len(pictures.figures) == 2
-    assert contents.caption == CONTENTS
 
 
 def hostile(run: Trajectory) -> Trajectory:

@@ -13,6 +13,7 @@ from omnibench.compare.report.tables import methods_table
 from omnibench.compare.result import ComparisonResult, EntryStatistics
 from omnibench.fit.cost import NO_ERROR
 from omnibench.fit.evaluate import positions_and_headings
+from omnibench.fit.noise import grouped
 from omnibench.report import blocks
 from omnibench.report.numbers import fixed, listing, percent, significant, span, typeset, with_unit
 from omnibench.report.path_pictures import CALIBRATED, paths_before_after
@@ -173,10 +174,8 @@ def _doubts(view: views.DatasetView) -> Iterator[str]:
         )
     # Commands on which it does worse than the design values
     before, after = best.typical.design[split].costs, best.typical.scores[split].costs
-    rows: dict[str, list[int]] = {}
-    for index, run in enumerate(view.dataset.split(split)):
-        if run.command is not None:
-            rows.setdefault(run.command, []).append(index)
+    commands = [run.command for run in view.dataset.split(split)]
+    rows = {name: list(alike) for alike in grouped(commands) if (name := commands[alike[0]]) is not None}
     means = [(name, float(before[chosen].mean()), float(after[chosen].mean())) for name, chosen in rows.items()]
     worse = sorted((row for row in means if row[2] > row[1]), key=lambda row: row[1] - row[2])
     if worse:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import plotly.graph_objects as go
@@ -81,22 +81,17 @@ class ComparisonView(Result):
         return shown
 
     def remarks(self) -> Sequence[Remark]:
-        return list(self._remarks())
-
-    def _remarks(self) -> Iterator[Remark]:
         result = self.result
-        for name, reason in result.broken.items():
-            yield Remark(f"cannot be read: {name}: {reason}", "warning")
+        found = [Remark(f"cannot be read: {name}: {reason}", "warning") for name, reason in result.broken.items()]
         shown = len(result.failures) if self.everything else _SHOWN
-        for failure in result.failures[:shown]:
-            yield Remark(f"no answer: {failure}", "warning")
+        found += [Remark(f"no answer: {failure}", "warning") for failure in result.failures[:shown]]
         if len(result.failures) > shown:
-            yield Remark(f"no answer: {len(result.failures) - shown} more; --all lists them", "warning")
+            found.append(Remark(f"no answer: {len(result.failures) - shown} more; --all lists them", "warning"))
         for name, entry in result.held_out.items():
             tone = _TONES.get(entry.verdict.verdict, "warning")
-            yield Remark(f"{name}, {entry.label}: {entry.verdict.sentence}", tone)
-            yield from (Remark(sentence, "warning") for sentence in result.sessions.get(name, ()))
-        yield Remark(f"report: {result.output / 'report.html'}")
+            found.append(Remark(f"{name}, {entry.label}: {entry.verdict.sentence}", tone))
+            found += [Remark(sentence, "warning") for sentence in result.sessions.get(name, ())]
+        return [*found, Remark(f"report: {result.output / 'report.html'}")]
 
     def document(self) -> Document:
         return comparison_document(self.result)

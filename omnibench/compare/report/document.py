@@ -11,12 +11,10 @@ from omnibench.compare.report.answer import answer_section, path_picture, robots
 from omnibench.compare.report.paper import flower_figures, paper_paths, published_blocks
 from omnibench.compare.report.searches import search_blocks
 from omnibench.compare.result import Cell, ComparisonResult
-from omnibench.errors import DataError
 from omnibench.report import blocks as page
 from omnibench.report.figures import DESIGN, is_drawn, motion_system
 from omnibench.report.numbers import count, listing
 from omnibench.report.recording.data_results import RobotResult
-from omnibench.report.recording.section import has_recording, recording_section
 from omnibench.report.render import reproduction_section
 from omnibench.report.style import INK
 from omnibench.robot.kinematics import Robot, class_of
@@ -130,11 +128,11 @@ def _sections(view: sets.DatasetView) -> Iterator[page.Section]:
     about = "All elements, their differences from the design values, and the wheels that they stand for."
     if view.calibrated:
         yield from _folded("matrices", "Matrices", about, *tables.matrix_blocks(view))
-    about = "Where the recordings come from, what they hold, and the robot's wheels."
+    about = "Where the recordings come from, and the robot's wheels."
     of_set = [robot for robot in result.robots if robot.name == view.name]
     (wheels,) = RobotResult(view.dataset.robot).tables()
     data = (tables.data_table(of_set, {}), replace(wheels, caption="Wheels, by design"), robot_picture(view))
-    yield from _folded("data", "Data and robot", about, *data, *_recording(view))
+    yield from _folded("data", "Data and robot", about, *data)
 
 
 def robot_picture(view: sets.DatasetView) -> page.FigureGrid | None:
@@ -165,12 +163,3 @@ def robot_picture(view: sets.DatasetView) -> page.FigureGrid | None:
     words = "A wheel's width is not known; its length is its diameter."
     words += " A fitted geometry takes up whatever else is wrong with the model." if fitted else ""
     return replace(motion_system(robot, fitted), caption=words)
-
-
-def _recording(view: sets.DatasetView) -> Iterator[page.Block]:
-    """Pictures of a recording with scans or targets; where scans cannot be read, the error stands in their place."""
-    if has_recording(view.dataset):
-        try:
-            yield from recording_section(view.dataset).blocks
-        except DataError as error:
-            yield page.Callout("No pictures", (str(error),), "warning")

@@ -18,24 +18,13 @@ from omnibench.fit.calibrators.genetic import GeneticOptions
 from omnibench.fit.intervals import Interval
 from omnibench.fit.noise import grouped
 from omnibench.registry import calibrators
-from omnibench.report.blocks import Block, Callout, Cell, Column, Fact, Facts, Figure, FigureGrid, Row, Table
-from omnibench.report.figures import START, line, marks, path
-from omnibench.report.numbers import (
-    MOST_MOTIONS,
-    NOTHING,
-    Motion,
-    count,
-    direction_of,
-    fixed,
-    listing,
-    motion_items,
-    motion_of,
-    moves,
-    percent,
-    seconds,
-    span,
-)
-from omnibench.report.recording.recording_figures import REFERENCE_ITEM, describe, evenly
+from omnibench.report import blocks as page
+from omnibench.report import numbers
+from omnibench.report.blocks import Block, Callout, Cell, Fact, Facts, FigureGrid, Row
+from omnibench.report.figures import line, marks
+from omnibench.report.numbers import NOTHING, count, fixed, listing, percent, seconds, span
+from omnibench.report.path_pictures import path_picture
+from omnibench.report.recording.recording_figures import REFERENCE_ITEM, describe
 from omnibench.report.style import AXIS, INK, plan, plot
 from omnibench.robot.kinematics import Array
 from omnibench.words import plural
@@ -44,7 +33,6 @@ _MET = 1e-4  # share of the lowest cost: searches that end nearer to it are in o
 _PUBLISHED_COST = "final_pose"  # published costs are those of Eq. (6)
 _DIRECTIONS = (30, 210, 120, 300)  # deg, of Fig. 6 (a) to (d)
 _TURN_RATE = 0.35  # rad/s
-_POINTS = 160  # points that a path is drawn with (chosen)
 
 
 def published_blocks(view: views.DatasetView) -> Iterator[Block]:
@@ -179,7 +167,7 @@ def _compared(
         yield ComparedFigure(f"Change of the {name} cost to validation{entry}", ours, tuple(changes), True, 1, methods)
 
 
-def _figure_table(view: views.DatasetView) -> Table:
+def _figure_table(view: views.DatasetView) -> page.Table:
     rows = []
     for figure in compared_figures(view):
         ours, decimals = figure.ours, 1 if figure.is_share else view.cost_decimals
@@ -209,18 +197,9 @@ def _figure_table(view: views.DatasetView) -> Table:
     note = "As published: the 95 % interval (small print) contains a published figure."
     if view.dataset.simulated:
         note = "No verdict: what was simulated so that it gives the published figures agrees with them by construction."
-    return Table(
-        f"Beside the published figures ({sources})",
-        (
-            Column("Figure", numeric=False),
-            Column("Here"),
-            Column("Published"),
-            Column("From the nearest"),
-            Column("Verdict", numeric=False),
-        ),
-        tuple(rows),
-        note,
-    )
+    verdict_column = page.Column("Verdict", numeric=False)
+    columns = page.columns("Figure", "Here", "Published", "From the nearest", verdict_column)
+    return page.Table(f"Beside the published figures ({sources})", columns, tuple(rows), note)
 
 
 def _circumstances(view: views.DatasetView) -> Facts:
@@ -267,8 +246,8 @@ def paper_paths(view: views.DatasetView) -> Iterator[FigureGrid]:
     chosen: dict[int, Trajectory] = {}
     for run in view.dataset.split(view.scored):
         turning = math.isclose(run.omega or 0.0, _TURN_RATE, abs_tol=1e-3)
-        if run.alpha is not None and turning and moves(run):
-            chosen.setdefault(round(direction_of(run)), run)
+        if run.alpha is not None and turning and numbers.moves(run):
+            chosen.setdefault(round(numbers.direction_of(run)), run)
     if not set(_DIRECTIONS) <= chosen.keys() or not view.published_entries:
         return
     models = [(views.THEORETICAL_STYLE, view.model())]
@@ -276,17 +255,9 @@ def paper_paths(view: views.DatasetView) -> Iterator[FigureGrid]:
         style = view.styles[entry.label]
         item = replace(style, label=f"{style.label}, as the paper's {result.label}")
         models.append((item, view.model(typical.matrix, typical.result.extension)))
-    figures = []
-    for run in map(chosen.__getitem__, _DIRECTIONS):
-        reference = run.poses[evenly(len(run.poses), 2 * _POINTS)]
-        traces = [path(REFERENCE_ITEM, reference, 3.5), marks(REFERENCE_ITEM, 9, *reference[-1:, :2].T)]
-        for item, model in models:
-            (poses,) = model.poses([run.log(np.linspace(0.0, run.end, _POINTS))])
-            traces += [path(item, poses, 1.8), marks(item, 7, *poses[-1:, :2].T)]
-        traces.append(marks(START, 9, run.start[:1], run.start[1:2], hover="start"))
-        figures.append(Figure(describe(run), plan(*traces), f"Paths of {describe(run)}, x and y in m", 400))
+    figures = tuple(path_picture(describe(chosen[direction]), chosen[direction], models) for direction in _DIRECTIONS)
     items = (REFERENCE_ITEM, *(item for item, _ in models))
-    yield FigureGrid(tuple(figures), items, 2, "As Fig. 6 and 7 of the paper.", "paths-of-the-paper")
+    yield FigureGrid(figures, items, 2, "As Fig. 6 and 7 of the paper.", "paths-of-the-paper")
 
 
 def flower_figures(view: views.DatasetView) -> Iterator[FigureGrid]:
@@ -294,18 +265,20 @@ def flower_figures(view: views.DatasetView) -> Iterator[FigureGrid]:
 
     Nothing where fewer than three directions were driven at each of a few speeds and rates of turn.
     """
-    groups: dict[Motion, dict[int, list[int]]] = {}
+    groups: dict[numbers.Motion, dict[int, list[int]]] = {}
     for index, run in enumerate(view.dataset.split(view.scored)):
-        if run.alpha is not None and run.omega is not None and moves(run):
-            groups.setdefault(motion_of(run), {}).setdefault(round(direction_of(run)) % 360, []).append(index)
-    few = not groups or len(groups) > MOST_MOTIONS or min(map(len, groups.values())) < 3
+        if run.alpha is not None and run.omega is not None and numbers.moves(run):
+            way = round(numbers.direction_of(run)) % 360
+            groups.setdefault(numbers.motion_of(run), {}).setdefault(way, []).append(index)
+    few = not groups or len(groups) > numbers.MOST_MOTIONS or min(map(len, groups.values())) < 3
     best, after = view.best, view.errors(view.best, view.scored)
     if best is None or after is None or few or not np.isfinite(after).all():
         return
-    items, largest = motion_items(sorted(groups)), float(np.hypot(*view.design_errors[view.scored][:, :2].T).max())
+    before = view.design_errors[view.scored]
+    items, largest = numbers.motion_items(sorted(groups)), float(np.hypot(*before[:, :2].T).max())
     factor, unit, _ = views.position_unit(largest)
     figures = []
-    for title, of_model in (("design values", view.design_errors[view.scored]), (best.label, after)):
+    for title, of_model in (("design values", before), (best.label, after)):
         traces, errors = [], factor * np.hypot(*of_model[:, :2].T)
         for item, motion in zip(items, sorted(groups), strict=True):
             means = {angle: float(errors[groups[motion][angle]].mean()) for angle in sorted(groups[motion])}
@@ -316,7 +289,7 @@ def flower_figures(view: views.DatasetView) -> Iterator[FigureGrid]:
         window = 1.08 * factor * largest * np.array([[-1.0, 1.0]] * 2)
         figure = plan(*traces, window=window, x_title=f"to the right ({unit})", y_title=f"ahead ({unit})")
         name = f"Mean final position error ({unit}), {title}"
-        figures.append(Figure(name, figure, f"{name}, by direction of motion and rate of turn", 300))
+        figures.append(page.Figure(name, figure, f"{name}, by direction of motion and rate of turn", 300))
     caption = "Distance from the middle: mean error over repetitions, along the commanded direction, forward up."
     yield FigureGrid(tuple(figures), tuple(items), 2, caption, "errors-by-direction")
 
@@ -359,5 +332,5 @@ def _fig_4(view: views.DatasetView) -> Iterator[FigureGrid]:
     hidden = {"visible": False}
     figure.update_layout(annotations=notes, xaxis=hidden, yaxis=hidden, margin_l=10, margin_b=10, font_size=12)
     words = "Initial population, odometry, cost; then stop, or selection, crossover and mutation"
-    picture = Figure("How the genetic search runs", figure, words, 500)
+    picture = page.Figure("How the genetic search runs", figure, words, 500)
     yield FigureGrid((picture,), (), 1, f"Fig. 4 of the paper, with the settings of {genetic.label}.", "fig-4")

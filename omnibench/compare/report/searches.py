@@ -51,8 +51,7 @@ class Course:
         gaps = self.costs / self.best_known - 1.0
         # 1e-12 allows for rounding: the best known cost itself has a gap of zero.
         first = np.searchsorted(-gaps, -TARGETS - 1e-12)
-        times: Array = np.where(first < len(gaps), self.evaluations[np.minimum(first, len(gaps) - 1)], np.inf)
-        return times
+        return np.where(first < len(gaps), self.evaluations[np.minimum(first, len(gaps) - 1)], np.inf)
 
 
 def courses(view: DatasetView) -> list[Course]:

@@ -20,7 +20,9 @@ from omnibench.fit.evaluate import positions_and_headings
 from omnibench.fit.intervals import Interval
 from omnibench.fit.span import driven_span
 from omnibench.registry import costs
+from omnibench.report import blocks, numbers
 from omnibench.report.blocks import Block, Cell, Code, Column, Row, RowRole, Table
+from omnibench.report.calibration_report import parameter_cells
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, listing, percent, seconds, significant
 from omnibench.robot.kinematics import Array, relative_deviations
 from omnibench.words import plural
@@ -197,7 +199,7 @@ def matrix_table(view: views.DatasetView, against: str | None = None, labels: Se
         driven = driven_span(view.dataset.split("train")).driven
         projector = driven.T @ driven
     names = [f"m{row}{column}" for row in (1, 2, 3) for column in range(1, reference.shape[1] + 1)]
-    first = view.entry_cell(None) if against is None else Cell(against)
+    first = Cell(against or THEORETICAL_NAME, "", "" if against else views.THEORETICAL_STYLE.colour)
     rows = [Row.of(first, *(fixed(float(value), 6) for value in reference.ravel()))]
     for entry, run in view.calibrated:
         if entry.label not in matrices or entry.label == against or (labels and entry.label not in labels):
@@ -210,7 +212,8 @@ def matrix_table(view: views.DatasetView, against: str | None = None, labels: Se
             absolute = "0" if abs(change) < 1e-15 else significant(float(change), 2, signed=True)
             note = absolute if math.isnan(share) else f"{fixed(100 * float(share), 3, signed=True)} %"
             cells.append(Cell(fixed(float(value), 6) + marks.get(name, ""), note))
-        rows.append(Row.of(view.entry_cell(entry), *cells, role="best" if entry.is_best else "plain"))
+        named = Cell(entry.label, entry.parameterisation, view.styles[entry.label].colour)
+        rows.append(Row.of(named, *cells, role=row_role(entry)))
     return Table(
         f"Matrices M⁻¹ and their differences from {'the design values' if against is None else against}",
         (Column("Entry", numeric=False), *(Column(n, "rad/rad" if n[1] == "3" else "m/rad") for n in names)),
@@ -221,30 +224,16 @@ def matrix_table(view: views.DatasetView, against: str | None = None, labels: Se
     )
 
 
-def all_digits(view: views.DatasetView) -> Code:
-    """Matrices with so many digits that reading them gives exactly the same numbers."""
-    named = [("theoretical", view.dataset.robot.inverse_kinematic_matrix)]
-    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
-    lines = (f"{json.dumps(label)}: {json.dumps(matrix.tolist())}" for label, matrix in named)
-    return Code("\n".join(lines), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")
-
-
 def parameter_table(view: views.DatasetView) -> Iterator[Table]:
     """Physical parameters of searched geometries and their deviation from the design values, as in section 4.2."""
     fitted = {entry.label: run.record for entry, run in view.calibrated if run.record.parameters}
     by_name: dict[str, dict[str, Cell]] = {}
     for label, record in fitted.items():
         for each in record.parameters or ():
-            share, turned = each.deviation_percent, each.unit == "rad"
-            note = "design is 0" if share is None else f"{fixed(share, 2, signed=True)} %"
-            if turned:  # an angle's zero is a convention, so that no share of it means anything
-                note = f"{fixed(math.degrees(each.deviation), 3, signed=True)}°"
-            design, value = (
-                f"{fixed(math.degrees(number), 3)}°" if turned else f"{fixed(number, 5)} {each.unit}"
-                for number in (each.design, each.value)
-            )
-            mark = bound_marks(record).get(each.name, "")
-            by_name.setdefault(each.name, {"": Cell(design)})[label] = Cell(f"{value} {mark}".strip(), note)
+            design, value, unit, change, _ = parameter_cells(each)
+            shown = numbers.typeset(f"{value} {unit}"), bound_marks(record).get(each.name, "")
+            of_labels = by_name.setdefault(each.name, {"": Cell(numbers.typeset(f"{design} {unit}"))})
+            of_labels[label] = Cell(" ".join(shown).strip(), numbers.typeset(change))
     rows = [Row.of(name, *(of.get(label, NOTHING) for label in ("", *fitted))) for name, of in by_name.items()]
     if rows:
         yield Table(
@@ -291,7 +280,7 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
     rows, unit = [], ""
     for number, each in enumerate(in_order):
         name = Cell(each.method, "" if each.family == "other" else each.family)
-        ratio = cell.against_design(each.method, judged)
+        ratio = cell.ratio(each.method, cells=judged)
         if ratio is None:
             rows.append(Row.of(name, *[NOTHING] * 4, each.status, NOTHING, each.reason, role="failed"))
             continue
@@ -316,16 +305,10 @@ def cell_table(result: ComparisonResult, cell: MethodCell) -> Table:
         )
     numbers = (("run", cell.pairs.runs), ("calibration", cell.pairs.folds))
     runs, folds = (plural(len(set(each.tolist())), word) for word, each in numbers)
-    columns = (
-        Column("Method", numeric=False),
-        Column("Cost"),
-        Column("of the design's"),
-        Column("Position", "mm", priority=1),
-        Column("Heading", "°", priority=1),
-        Column("Verdict", numeric=False),
-        Column("Time", priority=2),
-        Column("What it found", numeric=False, priority=3),
-    )
+    errors = (Column("Position", "mm", priority=1), Column("Heading", "°", priority=1))
+    ends = (Column("Verdict", numeric=False), Column("Time", priority=2))
+    found_column = Column("What it found", numeric=False, priority=3)
+    columns = blocks.columns("Method", "Cost", "of the design's", *errors, *ends, found_column)
     note = (
         f"Mean final errors, Eq. (6); {runs} of {plural(cell.pairs.sessions, 'session')} judge {folds}{unit}. "
         f"Intervals are of this cell; verdicts hold for each method in {plural(judged, 'cell')} together."
@@ -391,4 +374,8 @@ def matrix_blocks(view: views.DatasetView) -> Iterator[Block]:
     if {"geometry", "matrix"} <= of_paper.keys():
         yield matrix_table(view, of_paper["matrix"], [of_paper["geometry"]])
     yield from parameter_table(view)
-    yield all_digits(view)
+    # So many digits that reading them gives exactly the same numbers
+    named = [("theoretical", view.dataset.robot.inverse_kinematic_matrix)]
+    named += [(entry.label, run.matrix) for entry, run in view.calibrated if run.matrix is not None]
+    lines = (f"{json.dumps(label)}: {json.dumps(matrix.tolist())}" for label, matrix in named)
+    yield Code("\n".join(lines), "Matrices with all digits (YAML): rows x and y in m/rad, heading in rad/rad")

@@ -10,11 +10,10 @@ import numpy as np
 
 from omnibench.compare import result as results
 from omnibench.compare.config import THEORETICAL_NAME, CompareConfig, PublishedResult
-from omnibench.compare.plan import UNBOUNDED
 from omnibench.data.dataset import Dataset, Split
 from omnibench.fit.intervals import Clusters, Interval, units_of
 from omnibench.fit.reference_rows import measured_parts
-from omnibench.report.blocks import Cell, LegendItem
+from omnibench.report.blocks import LegendItem
 from omnibench.report.numbers import NOTHING, decimals_for, fixed, percent, significant, span
 from omnibench.report.style import SYMBOLS, THEORETICAL, colours
 from omnibench.robot.calibration import ModelExtension, extended_model
@@ -94,8 +93,7 @@ class DatasetView:
 
     def _told(self, errors: Array, split: Split) -> Array:
         placed, turned = measured_parts(self.dataset.split(split))
-        told: Array = np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
-        return told
+        return np.where(np.column_stack([placed, placed, turned]), errors, np.nan)
 
     def units(self, split: Split) -> Clusters:
         """The draws that a split's intervals rest on."""
@@ -170,16 +168,6 @@ class DatasetView:
         """Decimals of costs: four as in the paper, more where that leaves the lowest too few digits."""
         values = [cost.value for entry in self.statistics for cost in entry.costs.values()]
         return min(7, max(4, decimals_for(min(values, default=None), 3)))
-
-    def entry_cell(self, entry: results.EntryStatistics | None) -> Cell:
-        """An entry's name with its colour; None stands for the design values."""
-        if entry is None or entry.calibrator == THEORETICAL_NAME:
-            label = THEORETICAL_NAME if entry is None else entry.label
-            return Cell(label, "design values", THEORETICAL_STYLE.colour)
-        note = "geometry within limits" if entry.parameterisation == "geometry" else f"matrix, box {entry.box}"
-        if entry.box == UNBOUNDED:
-            note = f"{entry.parameterisation}, as given"
-        return Cell(entry.label, note, self.styles[entry.label].colour)
 
 
 def views(result: results.ComparisonResult) -> list[DatasetView]:

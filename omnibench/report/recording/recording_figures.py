@@ -106,14 +106,12 @@ def scan_points(trajectory: Trajectory, scanner: Scanner, scans: TrajectoryScans
     poses = compose(poses_at(trajectory, scans.times[scan] + scanner.delays[seen]), scanner.mount.pose)
     directions = poses[:, 2] - scanner.mount.yaw + scanner.bearings[seen]
     over_the_floor = (ranges[seen] * scanner.level_shares[seen])[:, None]
-    points: Array = poses[:, :2] + over_the_floor * np.column_stack([np.cos(directions), np.sin(directions)])
-    return points
+    return poses[:, :2] + over_the_floor * np.column_stack([np.cos(directions), np.sin(directions)])
 
 
 def evenly(count: int, limit: int) -> Array:
     """At most ``limit`` of the indices 0 to ``count`` - 1, evenly spaced, the first and the last among them."""
-    picks: Array = np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))
-    return picks
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))
 
 
 # How much one figure draws (chosen: more cannot be told apart on a screen).
@@ -181,8 +179,7 @@ def means_before(run: Trajectory, values: Array, times: Array, over: float = MEA
     sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values * np.diff(ends)[:, None], axis=0)])
     late = np.clip(times, over / 2, ends[-1])
     early = np.maximum(late - over, 0.0)
-    means: Array = (interpolated(late, ends, sums) - interpolated(early, ends, sums)) / (late - early)[:, None]
-    return means
+    return (interpolated(late, ends, sums) - interpolated(early, ends, sums)) / (late - early)[:, None]
 
 
 def wheel_rates(run: Trajectory, robot: Robot) -> FigureGrid:

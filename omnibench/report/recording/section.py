@@ -1,4 +1,4 @@
-"""A recording as it is shown, alone and in other reports: contents, paths, wheel rates, runs step by step.
+"""A recording as it is shown: contents, paths, wheel rates, runs step by step.
 
 Beside it reference poses by SLAM, with their errors against the truth. The document that templates/player.js plays:
 poses, wheel rates and scans of a run, rounded.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -321,7 +321,12 @@ def recording_document(
 
     DataError in one line: broken scans, or a truth of other runs.
     """
-    known = truth or {}
+    known, begun = truth or {}, starts or {}
+
+    def walls(run: Trajectory) -> list[Array]:
+        """The walls of the floor plan relative to a run's start, closed (n, 2) each, m."""
+        return [] if plan is None else [seen_from(begun.get(run.id, plan.start), each) for each in plan.outlines]
+
     accuracy = slam_accuracy(dataset, known) if known else accuracy
     metres = sum(float(np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum()) for run in dataset.trajectories)
     facts, compared = tiles(dataset, metres), list[blocks.Section]()
@@ -333,10 +338,13 @@ def recording_document(
         ]
         shown = (*((error_figures(dataset, known),) if known else ()), error_table(accuracy))
         compared = [blocks.Section("slam", "SLAM against the truth", shown)]
+    names = {run.id for run in dataset.trajectories}
+    inexact = f"The floor plan ({plan.name}) is drawn from the robot's mark, wherever a run began." if plan else ""
     answer = blocks.answer_section(
         f"{plural(len(dataset.trajectories), 'run')} of {dataset.robot.name}, {facts[1].value} {facts[1].note}.",
         facts,
-        path_overview(dataset, plan, starts),
+        path_overview(dataset, walls),
+        *([blocks.Paragraph(inexact, "note")] if plan and not begun.keys() >= names else []),
         blocks.Callout("Warnings on reading the data", dataset.warnings, "warning"),
     )
     return blocks.Document(
@@ -345,56 +353,30 @@ def recording_document(
         (
             answer,
             *compared,
-            *pictures(dataset, known, plan, starts),
+            *pictures(dataset, known, walls),
             blocks.Section("recorded", "What was recorded", (contents_table(dataset),)),
         ),
         blocks.simulated_badge(dataset.simulated),
     )
 
 
-def path_overview(
-    dataset: Dataset, plan: RoomPlan | None = None, starts: Mapping[str, Array] | None = None
-) -> blocks.FigureGrid:
+Walls = Callable[[Trajectory], Sequence[Array]]  # relative to the start of a run
+
+
+def path_overview(dataset: Dataset, walls: Walls = lambda _: ()) -> blocks.FigureGrid:
     """The paths of all runs from one start, and the room where there are scans."""
     first = next(iter(recording_figures.representative_runs(dataset).values()))
-    return recording_figures.all_runs(dataset, first, _outlines(plan, (starts or {}).get(first.id)))
-
-
-def has_recording(dataset: Dataset) -> bool:
-    """True if a data set holds more than wheel rates and poses: scans, or targets of the wheels."""
-    return dataset.scans is not None or any(run.targets is not None for run in dataset.trajectories)
-
-
-def recording_section(dataset: Dataset) -> blocks.Section:
-    """The section on a recording for another report. DataError in one line: broken scans."""
-    return blocks.Section("recording", "Recording", (path_overview(dataset), contents_table(dataset)), folded=True)
+    return recording_figures.all_runs(dataset, first, walls(first))
 
 
 def pictures(
-    dataset: Dataset,
-    truth: Mapping[str, TruePath] | None = None,
-    plan: RoomPlan | None = None,
-    starts: Mapping[str, Array] | None = None,
+    dataset: Dataset, truth: Mapping[str, TruePath] | None = None, walls: Walls = lambda _: ()
 ) -> list[blocks.Section]:
     """The sections on single runs: played step by step, and their wheel rates."""
-    begun, runs = starts or {}, recording_figures.representative_runs(dataset)
-    walls = {
-        run.id: [placed(run.start, outline) for outline in _outlines(plan, begun.get(run.id))] for run in runs.values()
-    }
-    odometry = OdometryModel.of_design(dataset.robot, "arc")
-    played: tuple[blocks.Block, ...] = (player(dataset, runs, odometry, truth or {}, walls),)
-    if plan is not None and not all(run.id in begun for run in runs.values()):
-        inexact = f"The floor plan ({plan.name}) is drawn from the robot's mark, wherever a run began."
-        played += (blocks.Paragraph(inexact, "note"),)
+    runs, odometry = recording_figures.representative_runs(dataset), OdometryModel.of_design(dataset.robot, "arc")
+    outlines = {run.id: [placed(run.start, outline) for outline in walls(run)] for run in runs.values()}
     rates = {name: (recording_figures.wheel_rates(run, dataset.robot),) for name, run in runs.items()}
     return [
-        blocks.Section("player", "Step by step", played),
+        blocks.Section("player", "Step by step", (player(dataset, runs, odometry, truth or {}, outlines),)),
         blocks.Section("wheels", "Wheel rates", (blocks.Choice("Run", rates),)),
     ]
-
-
-def _outlines(plan: RoomPlan | None, start: Array | None) -> list[Array]:
-    """The walls of a floor plan relative to a start pose (3,) in it (default: its own), closed (n, 2) each, m."""
-    if plan is None:
-        return []
-    return [seen_from(plan.start if start is None else start, outline) for outline in plan.outlines]

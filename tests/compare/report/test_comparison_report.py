@@ -11,7 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from browser import assert_picture_comes_first, opened
-from recording_samples import sample, with_a_tape
+from recording_samples import with_a_tape
 from report_page import Page
 from report_samples import config, flower, page, run, statistics, usual
 from sample_robots import APR02, LEVER_MECANUM
@@ -37,7 +37,6 @@ from omnibench.compare.report.view import DatasetView, views
 from omnibench.compare.result import ComparisonResult
 from omnibench.data.dataset import Dataset, make_dataset
 from omnibench.data.importers.table1 import APR_02
-from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.fit.intervals import Interval
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Callout, Fact, Figure, Table
@@ -294,25 +293,6 @@ def test_long_histories_and_runs_make_a_file_below_eight_megabytes(result: Compa
     report = page(replace(small, runs=(*small.runs, *many)), tmp_path)
     assert len(report.html) < 8e6
     assert report.row("Every run", "random_search")
-
-
-def test_recordings_with_scans_or_targets_have_their_pictures(told: Render) -> None:
-    made = sample().dataset
-    report = told({"room": made})
-    assert "data" in report.sections
-    contents = next(rows for caption, rows in report.tables.items() if ", robot " in caption)
-    assert next(row for row in contents if row[0] == "LIDAR scans")[1].endswith(" scans")
-    plain = replace(made, scans=None, trajectories=tuple(replace(t, targets=None) for t in made.trajectories))
-    assert "recording" not in told({"room": plain}).sections
-
-
-def test_scans_that_cannot_be_read_cost_the_pictures_and_not_the_report(told: Render, tmp_path: Path) -> None:
-    save_dataset(sample().dataset, tmp_path / "data")
-    dataset = load_dataset(tmp_path / "data")
-    (tmp_path / "data" / "scans.parquet").write_bytes(b"broken")
-    report = told({"room": dataset})
-    assert "scans.parquet: " in report.text
-    assert report.row("Outcomes and time", "closed_form")
 
 
 def test_a_browser_draws_every_plot_and_finds_no_fault(result: ComparisonResult, tmp_path: Path) -> None:
