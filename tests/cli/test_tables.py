@@ -136,8 +136,8 @@ def test_a_narrow_terminal_wraps_words_and_cuts_no_number(result: ComparisonResu
 def test_forty_four_columns_keep_the_cost_and_the_verdict(result: ComparisonResult) -> None:
     text = on_terminal(print_result, ComparisonView(result), width=44)
     heading = text[text.index("Entry") :].split("─")[0]
-    assert heading.split() == ["Entry", "Cost", "Verdict"]
-    left_out = "left out for want of room: 95 % interval, Improvement, Position (mm), Heading (°);"
+    assert heading.split() == ["Entry", "Cost", "best"]
+    left_out = "left out for want of room: 95 % interval, Improved, Position (mm), Heading (°);"
     assert left_out in " ".join(text.split())
 
 

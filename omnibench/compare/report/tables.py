@@ -55,7 +55,7 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
         label, role = THEORETICAL_NAME if entry is None else entry.label, row_role(entry)
         colour = views.THEORETICAL_STYLE if entry is design else view.styles[label]
         reached = fixed(None if cost is None else cost.value, decimals), views.interval_cell(cost, decimals)
-        fell, said = views.improvement_cells(improvement, 2), "" if entry is None else verdict(view, entry)
+        fell, said = views.improvement_cells(improvement, 1 if brief else 2), "" if entry is None else verdict(view, entry)
         finals = ((position, worst), (heading, most))
         ends = [Cell(mean, "" if mean == NOTHING else f"worst {largest}") for mean, largest in finals]
         judged: list[Cell | str] = [Cell(*difference), said] if split == view.scored else []
@@ -70,10 +70,10 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
             theirs = Cell(fixed(after, 4), f"from {fixed(before, 4)}"), percent(result.improvement(split), 2)
             blank = [""] * (len(rows[0].cells) - 3)
             rows.append(Row.of(Cell(result.label, result.source), *theirs, *blank, role="muted"))
-    columns = [Column("Entry", numeric=False), Column("Cost"), Column("Improvement", priority=1)]
+    columns = [Column("Entry", numeric=False), Column("Cost"), Column("Improved", priority=1)]
     columns += [Column("Position", unit, priority=2), Column("Heading", "°", priority=3)]
     columns += [Column("Difference from the best")] if split == view.scored and not brief else []
-    columns += [Column("Verdict", numeric=False)] if split == view.scored else []
+    columns += [Column("Against the best", numeric=False)] if split == view.scored else []
     columns[2:2] = [Column("95 % interval", priority=4)] if brief else []
     name = f"{view.name}{' (simulated)' if view.dataset.simulated else ''}"
     title = f"{name}: {view.runs_in_words(split)}, cost {view.config.objective}"
