@@ -220,8 +220,7 @@ def _look(robot: Robot, run: Trajectory, of_wheels: float, of_reference: float) 
 
 def _lengths(robot: Robot, motions: Array) -> Array:
     """Lengths (...) of motions (..., 3), m; turning counts at the robot's reach."""
-    lengths: Array = np.hypot(motions[..., 0], motions[..., 1]) + robot.reach * np.abs(motions[..., 2])
-    return lengths
+    return np.hypot(motions[..., 0], motions[..., 1]) + robot.reach * np.abs(motions[..., 2])
 
 
 def _bends(robot: Robot, run: Trajectory, ways: Array) -> Array:
@@ -231,8 +230,7 @@ def _bends(robot: Robot, run: Trajectory, ways: Array) -> Array:
     rolled = np.append(0.0, np.cumsum(run.rates.mean(axis=1) * np.diff(run.times, prepend=0.0)))
     rolling = np.sign(np.diff(np.interp(run.pose_times, np.append(0.0, run.times), rolled)))
     signed = np.append(0.0, np.cumsum(np.diff(run.poses[:, 2]) * rolling))
-    bends: Array = np.diff(np.interp(np.arange(0.0, ways[-1], length), ways, signed))
-    return bends
+    return np.diff(np.interp(np.arange(0.0, ways[-1], length), ways, signed))
 
 
 def _expected_angles(robot: Robot, run: Trajectory) -> Array:

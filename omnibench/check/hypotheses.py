@@ -18,7 +18,7 @@ import numpy as np
 
 from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows
 from omnibench.data.finding import Finding, Kind, error
-from omnibench.data.recording import corrected_robot
+from omnibench.data.recording_options import corrected_robot
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, CarDrive, Drive, Robot, interpolated, rotation
 from omnibench.robot.odometry import WheelLog

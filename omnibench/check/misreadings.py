@@ -488,10 +488,8 @@ class _Moments:
         places.append((self.poses[:, 0] + 1j * self.poses[:, 1])[None])
         driven, seen = (place - (np.add.reduceat(place, firsts, axis=1) / counts)[:, run] for place in places)
         angles = np.angle(np.add.reduceat(driven * seen.conj(), firsts, axis=1))
-        off: Complex = driven - seen * np.exp(1j * angles)[:, run]
-        return off
+        return driven - seen * np.exp(1j * angles)[:, run]
 
     def _turns(self, headings: Array) -> Array:
         """Turns (..., S) since the moment before from headings since the start."""
-        turns: Array = headings - np.where(self.first, 0.0, np.roll(headings, 1, axis=-1))
-        return turns
+        return headings - np.where(self.first, 0.0, np.roll(headings, 1, axis=-1))

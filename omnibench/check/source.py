@@ -20,7 +20,8 @@ from omnibench.config import as_yaml, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.finding import Finding, error
 from omnibench.data.importers.dataset_folder import DatasetOptions, importer_of, read_dataset, recordings_of
-from omnibench.data.recording import Recording, ReferenceOptions, quantity_of
+from omnibench.data.recording import Recording
+from omnibench.data.recording_options import ReferenceOptions, quantity_of
 from omnibench.data.runs import dataset_of
 from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.data.stored import median_period

@@ -21,17 +21,8 @@ from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
 from omnibench.data.finding import FindingWarning
-from omnibench.data.recording import (
-    SECONDS,
-    TURNS,
-    Event,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    WheelReadings,
-    quantity_of,
-    scan_difference,
-)
+from omnibench.data.recording import Event, PoseReadings, Recording, WheelReadings, scan_difference
+from omnibench.data.recording_options import SECONDS, TURNS, ReferenceOptions, quantity_of
 from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch

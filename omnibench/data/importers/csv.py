@@ -26,7 +26,8 @@ from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.data.delimited import ColumnError, Table, missing_column
 from omnibench.data.importer import Importer
 from omnibench.data.importers.tum import planar_headings, read_tum
-from omnibench.data.recording import PoseReadings, Recording, ReferenceOptions, RunAttributes, WheelReadings, words_of
+from omnibench.data.recording import PoseReadings, Recording, RunAttributes, WheelReadings
+from omnibench.data.recording_options import ReferenceOptions, words_of
 from omnibench.data.references import KINDS, NUMBERS, References, reference_flaw, references_of
 from omnibench.data.runs import dataset_of
 from omnibench.data.scratch import Scratch

@@ -13,15 +13,8 @@ from pydantic import Field, model_validator
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.importer import Importer
-from omnibench.data.recording import (
-    SECONDS,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RunAttributes,
-    ScanReadings,
-    WheelReadings,
-)
+from omnibench.data.recording import PoseReadings, Recording, RunAttributes, ScanReadings, WheelReadings
+from omnibench.data.recording_options import SECONDS, ReferenceOptions
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Ranges, Scans
 from omnibench.data.splits import Names, joined

@@ -36,17 +36,8 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers import bags
 from omnibench.data.importers.bags import Bag, Stamps, Topic, TopicMessages
-from omnibench.data.recording import (
-    Event,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RunAttributes,
-    Signs,
-    WheelReadings,
-    WheelUnit,
-    words_of,
-)
+from omnibench.data.recording import Event, PoseReadings, Recording, RunAttributes, WheelReadings
+from omnibench.data.recording_options import ReferenceOptions, Signs, WheelUnit, words_of
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.runs import WheelSamples, dataset_of, find_rests, measured_as
 from omnibench.data.scans import Mount

@@ -14,19 +14,8 @@ from pydantic import Field
 from omnibench.data.dataset import SPLITS, Dataset, Split
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.recording import (
-    METRES,
-    RADIANS,
-    HeadingUnit,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RobotOption,
-    RunAttributes,
-    ScanReadings,
-    WheelReadings,
-    WheelUnit,
-)
+from omnibench.data.recording import PoseReadings, Recording, RunAttributes, ScanReadings, WheelReadings
+from omnibench.data.recording_options import METRES, RADIANS, HeadingUnit, ReferenceOptions, RobotOption, WheelUnit
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Scanner
 from omnibench.data.splits import every_second, repetitions
