@@ -181,11 +181,10 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
     read, odd = evidence.read, odd_times(evidence.dataset)
     if not evidence.runs:
         return None
-    if not odd:
-        if evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED:
-            return None
-        if [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
-            return None
+    if not odd and (evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED):
+        return None
+    if not odd and [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
+        return None
     quantities: list[list[Finding]] = [[], *([finding] for finding in read.other_quantities())]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:

@@ -82,9 +82,21 @@ class Evidence:
 
     @cached_property
     def clocks(self) -> Sequence[ClockMatch | None]:
-        """The clocks of their references."""
+        """The clocks of their references; None where one does not show.
+
+        Of very many runs those that chance has drawn tell what all have in common; then each is matched by itself.
+        """
+        robot = self.dataset.robot
         smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in self.runs]
-        return clocks_of(self.dataset.robot, smooth)
+        if sum(len(run.times) for run in smooth) <= MOST_DRAWN:
+            return match_clocks(robot, [Streams.of_run(run) for run in smooth])
+        drawn = (ClockWindows.of(robot, Streams.of_run(run)) for run in drawn_runs(smooth, _TOGETHER))
+        usable = [windows for windows in drawn if windows is not None]
+        if not usable:
+            return [None] * len(smooth)
+        fitted, _ = fitted_together(usable, SEARCH)
+        tasks = [(robot, part, fitted) for part in together(smooth)]
+        return [clock for part in gathered(workers(), clocks_of_part, tasks) for clock in part]
 
     @cached_property
     def aligned(self) -> Sequence[Trajectory]:
@@ -125,22 +137,6 @@ class Evidence:
     def fit(self) -> FreeFit | None:
         """The matrix that fits these windows best."""
         return None if self.windows is None else self.windows.fit(self.dataset.robot.reach)
-
-
-def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
-    """The clock of every run's reference; None where it does not show.
-
-    Of very many runs those that chance has drawn tell what all have in common, and then each is matched by itself.
-    """
-    if sum(len(run.times) for run in runs) <= MOST_DRAWN:
-        return match_clocks(robot, [Streams.of_run(run) for run in runs])
-    drawn = (ClockWindows.of(robot, Streams.of_run(run)) for run in drawn_runs(runs, _TOGETHER))
-    usable = [windows for windows in drawn if windows is not None]
-    if not usable:
-        return [None] * len(runs)
-    fitted, _ = fitted_together(usable, SEARCH)
-    tasks = [(robot, part, fitted) for part in together(runs)]
-    return [clock for part in gathered(workers(), clocks_of_part, tasks) for clock in part]
 
 
 def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> list[ClockMatch | None]:

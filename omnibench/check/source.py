@@ -164,7 +164,7 @@ class RecordingSource:
 def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
     """The runs of a data set as recordings."""
     options = DatasetOptions(robot=dataset.robot, **given)
-    return recordings_of(dataset.trajectories, dataset.robot, None, options), options
+    return recordings_of(replace(dataset, scans=None), options), options
 
 
 def read_source(
@@ -181,9 +181,8 @@ def read_source(
     places = dataset_folders(source)
     if len(places) > 1:
         if form or settings:
-            raise ConfigError(
-                f"{places[0]} and {len(places) - 1} more: an importer reads one source; import each by itself"
-            )
+            several = f"{places[0]} and {len(places) - 1} more"
+            raise ConfigError(f"{several}: an importer reads one source; import each by itself")
         return replace(of_dataset(load_dataset(places)), places=tuple(places))
     (source,) = places
     check_source(source)

@@ -260,9 +260,7 @@ class Windows:
         shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
         return shares
 
-    def _system(
-        self, fitted: Sequence[Array], clock: Clock, deviations: Array | None = None
-    ) -> tuple[Array, Array, Array]:
+    def _system(self, fitted: Sequence[Array], clock: Clock, deviations: Array | None = None) -> tuple[Array, ...]:
         """Residuals (2, W) in standard deviations (2,), Huber's weights, and derivatives (P, 2, W) of what is shown.
 
         deviations: by default those of what is left. The derivatives are by the gains of both channels in this run,

@@ -18,8 +18,11 @@ from omnibench.data.dataset import Split
 from omnibench.data.references import References
 from omnibench.data.scans import Ranges, Scanner
 from omnibench.robot.kinematics import Array
+from omnibench.views import Brief
 from omnibench.words import plural
 
+Notes = list[str]
+"""What was left out, mended or decided on reading, which the warnings of the data set hold."""
 _SAME_SHAPE = 1e-5  # rad over the whole scan, m; differences within one scanner: messages are in single precision
 
 
@@ -55,8 +58,8 @@ class WheelReadings:
         return np.column_stack([np.interp(self.times, *pair) for pair in read])
 
 
-@dataclass(frozen=True, eq=False)
-class PoseReadings:
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseReadings(Brief):
     """Reference poses (K, 3) as recorded at times (K,), by their clock; covariances (K, 3, 3) where all have one.
 
     radians: the headings are in rad, whatever the option says. doubtful: name of what may be the robot's own odometry.

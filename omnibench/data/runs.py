@@ -21,8 +21,9 @@ from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
 from omnibench.data.finding import FindingWarning
-from omnibench.data.recording import Event, PoseReadings, Recording, WheelReadings, scan_difference
-from omnibench.data.recording_options import SECONDS, TURNS, ReferenceOptions, quantity_of
+from omnibench.data.recording import Event, Notes, PoseReadings, Recording, WheelReadings, scan_difference
+from omnibench.data.recording_options import SECONDS, TURNS, quantity_of
+from omnibench.data.recording_options import ReferenceOptions as Options
 from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch
@@ -115,7 +116,7 @@ class AlignedRecording:
         return replace(self, poses=replace(self.poses, times=moved(self.poses.times)), measured=measured)
 
 
-def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
+def _ranges(recordings: Sequence[Recording], options: Options, notes: Notes) -> list[float | None]:
     """The range of each wheel's counter, by all recordings, or the one that the options say; None if it has none."""
     count, unit = len(options.robot.wheel_names), ""
     by_wheel: list[list[Array]] = [[] for _ in range(count)]  # counts of every recording, without lone readings
@@ -142,7 +143,7 @@ def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: l
 
 
 def _readings(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
+    recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (F, N), rad, that count on, or rates, rad/s, in the robot's sense; and the readings that are used (F,).
 
@@ -174,9 +175,7 @@ def _readings(
     return values * options.wheel_factors(readings.unit), used
 
 
-def _counted_on(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
-) -> Array:
+def _counted_on(recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes) -> Array:
     """Positions (F, N) that count on where their counters begin again, with the turns that a register lost."""
     readings, lost, longest = recording.wheels, 0, 0.0
     seconds, columns = readings.times * SECONDS[options.wheel_time_unit], []
@@ -206,7 +205,7 @@ def _counted_on(
 
 
 def _wheel_samples(
-    recording: Recording, values: Array, used: NDArray[np.bool_], options: ReferenceOptions, notes: list[str]
+    recording: Recording, values: Array, used: NDArray[np.bool_], options: Options, notes: Notes
 ) -> WheelSamples:
     """The wheel samples of a recording, in stretches without gaps and restarts. values, used: see ``_readings``.
 
@@ -258,7 +257,7 @@ def _wheel_samples(
     return WheelSamples(begins[whole], ends[whole], rates[whole], angles, steering, stretch, rows[whole])
 
 
-def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptions) -> Array:
+def _steering_angles(shown: Array, recording: Recording, options: Options) -> Array:
     """Steering angles (F, S), rad, of the readings. DataError: they are whole numbers beyond a turn, as ticks are."""
     stated = any(name.startswith("steering_") for name in options.model_fields_set - {"steering_columns"})
     as_they_are = recording.a_run and not stated
@@ -276,7 +275,7 @@ def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptio
     return angles + np.radians(options.steering_offsets_deg or 0.0)
 
 
-def _misread(recording: Recording, rates: Array, durations: Array, options: ReferenceOptions) -> DataError:
+def _misread(recording: Recording, rates: Array, durations: Array, options: Options) -> DataError:
     """The error of mean rates (F, N), rad/s, over durations (F,), s, that are too fast to be in the unit."""
     unit = recording.wheels.unit
     counts = rates * durations[:, None] / options.wheel_factors(unit)
@@ -289,9 +288,7 @@ def _misread(recording: Recording, rates: Array, durations: Array, options: Refe
     return DataError(f"{what}; --set {first}, gear_ratio=N (turns of the motor for one of the wheel), {others}")
 
 
-def _aligned(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
-) -> AlignedRecording:
+def _aligned(recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes) -> AlignedRecording:
     """The recording in SI units and the robot's senses, its reference by its clock with the options' offset."""
     tell_reading(1, "run")
     samples = _wheel_samples(recording, *_readings(recording, ranges, options, notes), options, notes)
@@ -315,7 +312,7 @@ def _aligned(
     return aligned.later(options.pose_time_offset, options.pose_time_drift)
 
 
-def measured_as(measured: References, options: ReferenceOptions, second: float = 1.0) -> References:
+def measured_as(measured: References, options: Options, second: float = 1.0) -> References:
     """References in SI units and in the robot's senses. second: unit of their times, s.
 
     The signs of the poses hold for x and y of positions and displacements, and for turns and headings; distances have
@@ -331,9 +328,7 @@ def measured_as(measured: References, options: ReferenceOptions, second: float =
     return replace(measured, t0=t0, t1=t1, values=values, sigmas=sigmas, rate_sigma=measured.rate_sigma * abs(heading))
 
 
-def _by_matched_clocks(
-    aligned: Sequence[AlignedRecording], options: ReferenceOptions, notes: list[str]
-) -> list[AlignedRecording]:
+def _by_matched_clocks(aligned: Sequence[AlignedRecording], options: Options, notes: Notes) -> list[AlignedRecording]:
     """The recordings with poses by the wheels' clock, as matched, which ``notes`` tells."""
     matched, begun, streams, search = list(aligned), dict[int, AlignedRecording](), [], SEARCH
     for index, each in enumerate(aligned):
@@ -392,9 +387,7 @@ class MadeRun:
     scans: NDArray[np.intp]
 
 
-def dataset_of(
-    recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str], *, simulated: bool = False
-) -> Dataset:
+def dataset_of(recordings: Sequence[Recording], options: Options, notes: Notes, *, simulated: bool = False) -> Dataset:
     """The data set of the runs of recordings. DataError in one line: no run is left, or a unit cannot be right.
 
     notes: what was left out, mended or decided is added; the data set's warnings hold it.
@@ -439,9 +432,7 @@ def _in_file(run: MadeRun, scratch: Scratch) -> MadeRun:
     return replace(run, trajectory=trajectory, recording=replace(recording, wheels=none, poses=None, measured=None))
 
 
-def cut_into_runs(
-    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str], *, alone: bool = True
-) -> list[MadeRun]:
+def cut_into_runs(aligned: AlignedRecording, options: Options, notes: Notes, *, alone: bool = True) -> list[MadeRun]:
     """The runs of a recording, cut as the options say; what is left out is added to ``notes``.
 
     alone: the recording is the only one. DataError: its wheels and poses share no time.
@@ -493,7 +484,7 @@ def cut_into_runs(
     return referenced
 
 
-def _pieces(aligned: AlignedRecording, part: slice, options: ReferenceOptions) -> list[Piece]:
+def _pieces(aligned: AlignedRecording, part: slice, options: Options) -> list[Piece]:
     """The pieces of an unbroken stretch: between rests, events or windows, or all of it."""
     times, angles = aligned.samples.edges(part)
     span, stamps = (float(times[0]), float(times[-1])), aligned.poses.times
@@ -579,9 +570,7 @@ def from_events(
     return pieces
 
 
-def _without_lone_jumps(
-    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str]
-) -> tuple[AlignedRecording, Array]:
+def _without_lone_jumps(aligned: AlignedRecording, options: Options, notes: Notes) -> tuple[AlignedRecording, Array]:
     """The recording without lone poses that jump, and the times (B, 2), s, of the poses before and after each break."""
     samples, poses = aligned.samples, aligned.poses
     lone, broken = np.zeros((2, len(poses.times)), dtype=bool)  # broken: after each pose
@@ -602,7 +591,7 @@ def _without_lone_jumps(
     return replace(aligned, poses=poses), between[broken[:-1] | gap]
 
 
-def _unbroken(piece: Piece, aligned: AlignedRecording, breaks: Array, options: ReferenceOptions) -> Iterator[Piece]:
+def _unbroken(piece: Piece, aligned: AlignedRecording, breaks: Array, options: Options) -> Iterator[Piece]:
     """The parts of a piece without gaps and jumps, from rest on if wanted."""
     assert piece.span is not None  # it is not cut yet
     begin, end = piece.span
@@ -722,9 +711,7 @@ def _called(
     return replace(run, trajectory=replace(trajectory, **changes))
 
 
-def _with_references(
-    runs: Sequence[MadeRun], aligned: AlignedRecording, notes: list[str], *, whole: bool
-) -> list[MadeRun]:
+def _with_references(runs: Sequence[MadeRun], aligned: AlignedRecording, notes: Notes, *, whole: bool) -> list[MadeRun]:
     """The runs of a recording with those of its references that lie within them; the others are added to ``notes``.
 
     whole: the recording is one run, of whose start and end a reference without times tells. Runs without poses and
@@ -784,7 +771,7 @@ def _apart(aligned: AlignedRecording, offset: float) -> DataError:
     return DataError(f"{place}: no two poses while the wheels were recorded ({spans}); {way}")
 
 
-def with_commands(runs: Sequence[Trajectory], options: ReferenceOptions, notes: list[str]) -> list[Trajectory]:
+def with_commands(runs: Sequence[Trajectory], options: Options, notes: Notes) -> list[Trajectory]:
     """The runs with the commands that their names say, by ``command_pattern`` or by the words before their numbers."""
     if options.command_pattern:
         matches = [re.search(options.command_pattern, run.id.partition("#")[0]) for run in runs]
@@ -822,9 +809,7 @@ def _command_in(name: str) -> str:
     return "_".join(next((words for words in reversed(parts) if words), []))
 
 
-def divided_runs(
-    runs: Sequence[Trajectory], made: Sequence[MadeRun], options: ReferenceOptions, notes: list[str]
-) -> list[Trajectory]:
+def divided_runs(runs: Sequence[Trajectory], made: list[MadeRun], options: Options, notes: Notes) -> list[Trajectory]:
     """The runs with their splits and the numbers of their repetitions, without those that are left out.
 
     Without patterns and without splits in the source every second run of a command validates, and of runs without a

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from omnibench.config import read_yaml, validate
 from omnibench.data.importers.tum import planar_headings
-from omnibench.data.recording import ScanReadings, ScanShape, scan_difference
+from omnibench.data.recording import Notes, ScanReadings, ScanShape, scan_difference
 from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
@@ -86,7 +86,7 @@ class Bag:
     clock_logged: Stamps
 
     def __init__(
-        self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: list[str]
+        self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: Notes
     ) -> None:
         self.path, self.definitions, self.notes, self._reader = path, definitions, notes, reader
         self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
@@ -227,9 +227,7 @@ def way_up(frame: str, parents: Mapping[str, str], ends: Callable[[str], bool]) 
 
 
 @contextmanager
-def open_bag(
-    path: Path, notes: list[str], recorded: Sequence[str] = (), definitions: Sequence[Path] = ()
-) -> Iterator[Bag]:
+def open_bag(path: Path, notes: Notes, recorded: Sequence[str] = (), definitions: Sequence[Path] = ()) -> Iterator[Bag]:
     """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged.
 
     notes, recorded: as for ``Bag``. definitions: files or folders of .msg files, of types that the bag does not define.

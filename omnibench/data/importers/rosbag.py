@@ -36,7 +36,7 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers import bags
 from omnibench.data.importers.bags import Bag, Stamps, Topic, TopicMessages
-from omnibench.data.recording import Event, PoseReadings, Recording, RunAttributes, WheelReadings
+from omnibench.data.recording import Event, Notes, PoseReadings, Recording, RunAttributes, WheelReadings
 from omnibench.data.recording_options import ReferenceOptions, Signs, WheelUnit, words_of
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.runs import WheelSamples, dataset_of, find_rests, measured_as
@@ -250,7 +250,7 @@ def _listed(topics: Sequence[Topic]) -> str:
     return ", ".join(map(str, topics)) or "none"
 
 
-def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
+def read_bag(path: Path, name: str, options: RosbagOptions, notes: Notes) -> Recording:
     """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
     with bags.open_bag(path, notes, options.recorded_stamps, [*map(Path, options.message_definitions)]) as bag:
         topics = wheel_topics(bag, options)
@@ -710,7 +710,7 @@ class Rosbag(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All bags at or below ``source``; DataError names the bag, the topic and the message of what is wrong."""
-        notes: list[str] = []
+        notes = list[str]()
         recordings = self.recordings(source, notes)
         dataset = dataset_of(recordings, self.options, notes)
         doubtful = sorted({each.poses.doubtful for each in recordings if each.poses and each.poses.doubtful})
@@ -720,7 +720,7 @@ class Rosbag(Importer):
             raise DataError(f"{source}: {', '.join(doubtful)} is the robot's own odometry: {own}; {way}")
         return dataset
 
-    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+    def recordings(self, source: Path, notes: Notes) -> list[Recording]:
         """The bags at or below ``source`` as they were recorded."""
         recordings = [read_bag(path, name, self.options, notes) for name, path in bags.find_bags(source).items()]
         bare = [recording.place for recording in recordings if not recording.referenced]

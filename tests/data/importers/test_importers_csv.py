@@ -891,6 +891,7 @@ def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path:
     run = the_run(write(tmp_path / "log", a_wheels=wheel_table(), a_references=table), pose_time_unit="ms")
     slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
     options = DatasetOptions(robot=ROBOT, wheel_time_unit="ms", pose_time_unit="ms")
-    recordings = recordings_of([replace(slow, times=run.times * 1e3)], options.robot, None, options)
+    dataset = Dataset("slow", ROBOT, 1.0, (replace(slow, times=run.times * 1e3),))
+    recordings = recordings_of(dataset, options)
     (mended,) = dataset_of(recordings, options, []).trajectories
     assert measured(mended) == [(kind, pytest.approx(t0), pytest.approx(t1), v) for kind, t0, t1, v in measured(run)]
