@@ -132,7 +132,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     for detector, hidden_by in DETECTORS:
         if hidden_by & {finding.kind for finding in others if finding.severity == "error"}:
             continue
-        findings = [*detector(evidence)]
+        findings = (*detector(evidence),)
         by_options = detector is misreadings and not read.findings and any(finding.changes for finding in findings)
         if by_options and (mended := read.mended(findings)) is not None:
             return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
@@ -142,7 +142,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     for finding in (*read.findings, *others):
         distinct.setdefault((finding.kind, finding.where), finding)
     ordered = sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
-    findings = read.with_fixes(ordered)
+    findings = tuple(read.with_fixes(ordered))
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
     misread = MISREAD & {each.kind for each in ordered if each.severity == "error" and each not in read.findings}
@@ -162,14 +162,9 @@ def check_recording(read: RecordingSource) -> CheckReport:
         sentence = f"{read.dataset.name} {must}: {(typed or errors or missing)[0].what}"
         more = len(findings) - 1
         sentence += f" (and {more} more {noun_for(more, 'finding')})" if more else ""
+    command, clocks = read.command(typed), tuple(evidence.clocks)
     return CheckReport(
-        verdict=verdict,
-        needed=needed,
-        findings=tuple(findings),
-        sentence=sentence,
-        gain=gain,
-        command=read.command(typed),
-        clocks=tuple(evidence.clocks),
+        verdict=verdict, needed=needed, findings=findings, sentence=sentence, gain=gain, command=command, clocks=clocks
     )
 
 

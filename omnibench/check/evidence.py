@@ -185,9 +185,9 @@ def _look(robot: Robot, run: Trajectory, of_wheels: float, of_reference: float) 
         return tuple((ends - begins)[driven > _DRIVEN].tolist())
 
     fast = int((np.abs(run.rates) * robot.radii > _FASTEST).any(axis=1).sum())
-    wheel_gaps = gaps(edges, of_wheels)
+    of_run = run.id, len(run.times), fast, gaps(edges, of_wheels)
     if not run.has_poses:
-        return Look(run.id, len(run.times), fast, wheel_gaps)
+        return Look(*of_run)
     # Stretches of equal poses, from first to last.
     moves = np.diff(run.poses, axis=0)
     bounds = np.flatnonzero(np.concatenate([[True], np.abs(moves).max(axis=1) > SAME, [True]]))
@@ -199,19 +199,14 @@ def _look(robot: Robot, run: Trajectory, of_wheels: float, of_reference: float) 
     seen = _lengths(robot, run.poses[last] - run.poses[first])
     still = long & (wheels > _DRIVEN) & (seen < _STILL * wheels)
     seen_ways = np.append(0.0, np.cumsum(_lengths(robot, moves)))
-    return Look(
-        run.id,
-        len(run.times),
-        fast,
-        wheel_gaps,
-        gaps(run.pose_times, of_reference),
-        float(seconds[still].sum()),
-        np.abs(run.rates).T @ np.diff(run.times, prepend=0.0),
-        _expected_angles(robot, run),
-        None if run.steering is None else np.array([run.steering.min(axis=0), run.steering.max(axis=0)]),
-        None if run.steering is None else _bends(robot, run, seen_ways),
-        _at_once(edges, ways) and _at_once(run.pose_times, seen_ways),
-    )
+    counted, expected = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0), _expected_angles(robot, run)
+    steering = bends = None
+    if run.steering is not None:
+        steering = np.array([run.steering.min(axis=0), run.steering.max(axis=0)])
+        bends = _bends(robot, run, seen_ways)
+    at_once = _at_once(edges, ways) and _at_once(run.pose_times, seen_ways)
+    reference_gaps, standing = gaps(run.pose_times, of_reference), float(seconds[still].sum())
+    return Look(*of_run, reference_gaps, standing, counted, expected, steering, bends, at_once)
 
 
 def _lengths(robot: Robot, motions: Array) -> Array:

@@ -269,7 +269,16 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         contradicting = _contradicting(recording)
         return moments.off_centre() if positions and not contradicting else Explained(contradicting)
-    hypotheses = list(_sparse_hypotheses(recording))
+    # Mistakes of the wheels, one of them or none, each with every unit of the positions. Factors of rates and radii
+    # that a calibration is for are left out: sparse poses do not tell them from another design.
+    wheels = []
+    for wheel in readings.wheel_hypotheses(robot, counted=recording.counted):
+        scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
+        small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
+        if wheel.reading is None and not small:
+            wheels.append(wheel)
+    simple = [wheel for wheel in wheels if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit"]
+    hypotheses = [*wheels, *(wheel.with_reference(unit) for unit in readings.position_units() for wheel in simple)]
     if positions:
         hypotheses.append(plain.with_reference(readings.mirrored_positions()))
     scored = []
@@ -309,25 +318,6 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
     best = int(shares.argmin())
     return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
-
-
-def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
-    """Mistakes of the wheels, one of them or none, each with every unit of the positions.
-
-    Factors of rates and radii that a calibration is for are left out: sparse poses do not tell them from another
-    design.
-    """
-    wheels = []
-    for wheel in readings.wheel_hypotheses(recording.robot, counted=recording.counted):
-        scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
-        small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
-        if wheel.reading is None and not small:
-            wheels.append(wheel)
-    yield from wheels
-    for unit in readings.position_units():
-        for wheel in wheels:
-            if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit":
-                yield wheel.with_reference(unit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,8 @@ from omnibench.compare.config import (
     RobotChoice,
     TrainingChoice,
 )
-from omnibench.data.dataset import SPLITS, Dataset, Trajectory
-from omnibench.data.splits import repetitions, training_split
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory, repetitions
+from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError, nearest
 from omnibench.fit.calibrator import refusal_of
 from omnibench.fit.geometry import GeometryLimits

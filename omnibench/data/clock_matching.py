@@ -404,9 +404,8 @@ def _solved(columns: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
     for _ in range(2):
         sizes = np.abs(wanted - (columns @ solution[..., None])[..., 0])
         deviation = 1.4826 * _median(sizes, counted)[..., None]
-        weights = np.where(
-            deviation > 0, counted * np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300)), weights
-        )
+        robust = counted * np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300))
+        weights = np.where(deviation > 0, robust, weights)
         solution = _weighted(columns, wanted, weights)
     return solution
 

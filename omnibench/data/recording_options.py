@@ -90,15 +90,15 @@ Drift = Annotated[float, Field(gt=-_LARGEST_DRIFT, lt=_LARGEST_DRIFT)]
 Jumps = Literal["keep", "drop", "cut"]
 
 
+_ROBOT = "--set robot=FILE.yaml, or robot.yaml in the source or beside it; import csv --template DIR writes one"
+
+
 class RunsOptions(Options):
     """The robot, which runs train and validate, and what the data set says of itself."""
 
     group: ClassVar[str] = "Robot and runs"
 
-    robot: RobotOption = Field(
-        description="--set robot=FILE.yaml, or robot.yaml in the source or beside it; import csv --template DIR writes "
-        "one"
-    )
+    robot: RobotOption = Field(description=_ROBOT)
     wheels: dict[str, dict[str, Any]] = Field({}, description="values in place of the file's, as {left: {y: 0.12}}")
     mount: dict[str, float] | None = Field(None, description="tracked point, {x: 0.1, y: 0} (m), yaw (rad) or yaw_deg")
     train: Names = Field((), description="patterns of run names that train")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
-from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory, every_second, make_dataset
 from omnibench.data.finding import FindingWarning
 from omnibench.data.recording import Event, Notes, PoseReadings, Recording, WheelReadings, scan_difference
 from omnibench.data.recording_options import SECONDS, TURNS, quantity_of
@@ -27,7 +27,7 @@ from omnibench.data.recording_options import ReferenceOptions as Options
 from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch
-from omnibench.data.splits import complete, divided, every_second, remaining
+from omnibench.data.splits import complete, divided, remaining
 from omnibench.data.spoiled_references import reference_jumps
 from omnibench.errors import DataError
 from omnibench.progress import tell_reading
@@ -101,8 +101,6 @@ class AlignedRecording:
 
     def later(self, offset: float, drift: float) -> AlignedRecording:
         """With a reference that is later by offset (s) and by drift (s per s since its first finite time)."""
-        if not offset and not drift:
-            return self
         measured, stamps = self.measured, self.poses.times[:1]
         if measured is not None and not len(stamps):
             stamps = np.append(measured.t0, measured.t1)

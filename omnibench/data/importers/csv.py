@@ -267,9 +267,8 @@ _TURNS = frozenset(("orientation", "rotation", "quaternion", "quat", "q", "rot")
 def missing_error(table: Table, missing: Sequence[str], options: CsvOptions) -> ColumnError:
     """The error that names what is missing, by its keys, what was found, and what to type if that is meant."""
     if not table.headed:
-        way = (
-            f'say by numbers, from 1, which of them are {", ".join(missing)}: --set "columns={{{missing[0]}: 1, ...}}"'
-        )
+        typed = f'--set "columns={{{missing[0]}: 1, ...}}"'
+        way = f"say by numbers, from 1, which of them are {', '.join(missing)}: {typed}"
         return ColumnError(f"{table.file}: it has no header and {len(table.names)} columns; {way}")
     names = [f"'{options.accepted[key][0]}'" for key in missing]
     what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
@@ -468,9 +467,8 @@ def _by_headers(
         apart = [streams_in(table, options, shared=False) for table, _ in lacking]
         of_wheels, of_poses = ([each.table.file for each in of if not each.missing] for of in zip(*apart, strict=True))
         if of_wheels and of_poses:
-            way = (
-                "call them <run>_wheels.csv and <run>_poses.csv, or --set wheel_suffix=ENDING --set pose_suffix=ENDING"
-            )
+            endings = "--set wheel_suffix=ENDING --set pose_suffix=ENDING"
+            way = f"call them <run>_wheels.csv and <run>_poses.csv, or {endings}"
             raise DataError(f"{of_wheels[0]} holds wheels and {of_poses[0].name} poses; {way}")
         raise missing_error(*min(lacking, key=lambda pair: len(pair[1])), options)
     if lacking:
@@ -621,10 +619,8 @@ def _wheels(stream: Stream, table: Table, options: CsvOptions, notes: Notes) -> 
     count = len(options.robot.wheel_names)
     times, values, names, _ = _values(stream, table, notes)
     steering = values[:, count:] if len(names) > count else None
-    place = "" if stream.shared else str(table.file)
-    return WheelReadings(
-        times, values[:, :count], options.wheel_unit, steering, names[:count], names[count:], place=place
-    )
+    place, columns = "" if stream.shared else str(table.file), (names[:count], names[count:])
+    return WheelReadings(times, values[:, :count], options.wheel_unit, steering, *columns, place=place)
 
 
 def _poses(stream: Stream, table: Table, options: CsvOptions, notes: Notes) -> PoseReadings:

@@ -280,15 +280,12 @@ class Optiodom(Importer):
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
         kind, sentences = kinds()[robot], (f"{note[:1].upper()}{note[1:]}." for note in notes)
-        dataset = make_dataset(
-            options.name,
-            kind.robot(*common, options.robot_name or f"inesc_tec_{robot}"),
-            usual_period([run.pose_times for run in runs]),
-            divided(complete(runs), train, options.validation, "group", names=groups),
-            description=" ".join([kind.description.format(kind.title), *sentences]),
-            source=options.source,
-            licence="MIT",
-        )
+        description = " ".join([kind.description.format(kind.title), *sentences])
+        described: dict[str, Any] = {"description": description, "source": options.source, "licence": "MIT"}
+        design = kind.robot(*common, options.robot_name or f"inesc_tec_{robot}")
+        parted = divided(complete(runs), train, options.validation, "group", names=groups)
+        period = usual_period([run.pose_times for run in runs])
+        dataset = make_dataset(options.name, design, period, parted, **described)
         return replace(dataset, warnings=(*notes, *dataset.warnings))
 
 
@@ -318,9 +315,8 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
     rates, poses = ticks[1:] * session.angle_per_tick / steps[:, None], table.columns(_POSE[1:])
     steering = table.columns(("steering",))[1:] if "steering" in table else None
     name = f"{session.group}_{table.file.stem}"
-    run = Trajectory(
-        name, "train", times[1:], rates, times, poses, session=session.name, duration=end, steering=steering
-    )
+    known: dict[str, Any] = {"session": session.name, "duration": end, "steering": steering}
+    run = Trajectory(name, "train", times[1:], rates, times, poses, **known)
     if not with_log:
         return run
     robot = kind.robot(session.lengths, session.diameters, session.robot)

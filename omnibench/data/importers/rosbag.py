@@ -281,7 +281,10 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: Notes) -> Rec
             raise DataError(f"{error}; scans=false leaves the scans out") from None
         place, sensed = f"{path}: topic {topics[0].name}", BagSensors(readings, options) if readings else None
         poses = read_poses(bag, references[0], options) if references else None
-        events = _events(bag, cutting) if cutting else ()
+        # Messages at which runs begin, with the text of a String as the command.
+        texts, begins = cutting and cutting.type == "std_msgs/msg/String", bag.timed(cutting) if cutting else ()
+        shown = [(time, str(message.data if texts and message else "")) for time, message in begins]
+        events = tuple(Event(time, one_line(text) or None) for time, text in shown)
         said = RunAttributes(sent=_sent_twists(bag, sent) if sent else None)
         return Recording(name, place, wheels, poses, None, events, said, seen, sensed, numbered=True)
 
@@ -636,13 +639,6 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[Stamp
             step = np.broadcast_to([*matrix[:2, 3], np.arctan2(matrix[1, 0], matrix[0, 0])], whole.shape)
         whole = compose(whole, step)
     return stamps, whole
-
-
-def _events(bag: Bag, topic: Topic) -> tuple[Event, ...]:
-    """The messages of a topic as events, with the text of a String as the command."""
-    texts = topic.type == "std_msgs/msg/String"
-    shown = [(time, str(message.data if texts and message else "")) for time, message in bag.timed(topic)]
-    return tuple(Event(time, one_line(text) or None) for time, text in shown)
 
 
 def _sent_twists(bag: Bag, topic: Topic) -> Array | None:

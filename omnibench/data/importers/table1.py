@@ -11,14 +11,13 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.dataset import SPLITS, Dataset, Split, every_second, repetitions
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
 from omnibench.data.recording import Notes, PoseReadings, Recording, RunAttributes, ScanReadings, WheelReadings
 from omnibench.data.recording_options import METRES, RADIANS, HeadingUnit, ReferenceOptions, RobotOption, WheelUnit
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Scanner
-from omnibench.data.splits import every_second, repetitions
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array, Robot
