@@ -17,7 +17,7 @@ from scipy.special import ndtr, stdtrit
 from omnibench.check.evidence import SAME, Evidence, looks_of, pose_period
 from omnibench.check.hypotheses import POSITION_UNITS, another_zero, wheels_in_words
 from omnibench.data.dataset import Trajectory
-from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
+from omnibench.data.finding import CounterRestart, Finding, Kind, Severity, error
 from omnibench.data.references import KINDS, UNITS, ReferenceKind
 from omnibench.data.spoiled_references import follows_the_wheels, reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
@@ -79,7 +79,7 @@ def runs_in_words(runs: Sequence[str], every: int) -> str:
 
 def notes(evidence: Evidence) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended, and a note where not all runs are looked at together."""
-    restarts = [each.what for each in findings_of(evidence.dataset.warnings) if each.kind == "counter_restart"]
+    restarts = [warning for warning in evidence.dataset.warnings if isinstance(warning, CounterRestart)]
     if restarts:
         what = "; ".join(restarts[:_MOST_NOTES])
         what += f"; and {len(restarts) - _MOST_NOTES} more such notes" if len(restarts) > _MOST_NOTES else ""
@@ -252,11 +252,11 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
     found = {run.id: reference_jumps(robot, run.log(run.pose_times), run.poses) for run in runs}
-    lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))
-    poses = sum(len(each.lone) for each in found.values())
+    lone, shifts = ([run for run, each in found.items() if len(each[kind])] for kind in (0, 1))
+    poses = sum(len(of_run) for of_run, _ in found.values())
     if shifts:
         beside = f", and {plural(poses, 'lone pose')} jump and return" if lone else ""
-        count = plural(sum(len(each.shifts) for each in found.values()), "time")
+        count = plural(sum(len(of_run) for _, of_run in found.values()), "time")
         what = f"the reference jumps {count} for good, farther than the wheels drive{beside}"
         where = f"poses of {runs_in_words(list(dict.fromkeys([*shifts, *lone])), len(runs))}"
         yield error("reference_jump", what, where, {"jumps": "cut"})

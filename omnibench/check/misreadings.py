@@ -98,9 +98,8 @@ class Recorded:
     def in_degrees(self) -> Recorded:
         """With headings that were recorded in degrees."""
         as_read = self.as_read or self.poses
-        headings = [np.radians(np.unwrap(poses[:, 2], period=360.0)) for poses in as_read]
-        pairs = zip(self.poses, headings, strict=True)
-        return replace(self, poses=[np.column_stack([poses[:, :2], turned]) for poses, turned in pairs])
+        pairs = [(poses[:, :2], np.radians(np.unwrap(poses[:, 2], period=360.0))) for poses in as_read]
+        return replace(self, poses=[np.column_stack(pair) for pair in pairs])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
 from omnibench.data.dataset import SPLITS, Dataset, Trajectory, every_second, make_dataset
-from omnibench.data.finding import FindingWarning
+from omnibench.data.finding import CounterRestart
 from omnibench.data.recording import Event, Notes, PoseReadings, Recording, WheelReadings, scan_difference
 from omnibench.data.recording_options import SECONDS, TURNS, quantity_of
 from omnibench.data.recording_options import ReferenceOptions as Options
@@ -165,7 +165,7 @@ def _readings(
         used[rows[jumping.any(axis=1)]] = False
         if count := int(jumping.sum()):
             jump = f"{plural(count, 'single reading')} of wheel positions that jump and return left out"
-            notes.append(FindingWarning.of_restart(f"{place}: {jump}"))
+            notes.append(CounterRestart(f"{place}: {jump}"))
     if not recording.a_run and (held := counters.held_readings(values[used])).any():
         used[np.flatnonzero(used)[held]] = False
         holding = f"rows in which the wheels hold their last value left out: {1 - held.mean():.0%} are read"
@@ -198,7 +198,7 @@ def _counted_on(recording: Recording, ranges: Sequence[float | None], options: O
     if lost:
         back = f"{plural(lost, 'step')} of wheel positions ran back by a register of {longest:.10g} ticks, read late"
         mended = f"{back}; they got a turn of it back (wraps_at=2^32 or never keeps them)"
-        notes.append(FindingWarning.of_restart(f"{recording.place}: {mended}"))
+        notes.append(CounterRestart(f"{recording.place}: {mended}"))
     return np.column_stack(columns)
 
 
@@ -242,7 +242,7 @@ def _wheel_samples(
     if count := int(restart.sum()):
         anew = f"the positions begin anew {plural(count, 'time')}, faster than any wheel turns"
         way = "if that is a counter that wraps, --set wraps_at=N"
-        notes.append(FindingWarning.of_restart(f"{place}: {anew} ({way}); runs end there"))
+        notes.append(CounterRestart(f"{place}: {anew} ({way}); runs end there"))
     steering: Array | None = None
     if readings.steering is not None:
         steering = _steering_angles(readings.steering, recording, options)
@@ -577,9 +577,9 @@ def _without_lone_jumps(aligned: AlignedRecording, options: Options, notes: Note
             inside = (poses.times >= samples.begins[part][0]) & (poses.times <= samples.ends[part][-1])
             if (seen := np.flatnonzero(inside)).size:
                 log = samples.log(options.robot, part, poses.times[seen])
-                jumps = reference_jumps(options.robot, log, poses.poses[seen])
-                lone[seen[jumps.lone]] = True
-                broken[seen[jumps.shifts]] = options.jumps == "cut"
+                alone, shifts = reference_jumps(options.robot, log, poses.poses[seen])
+                lone[seen[alone]] = True
+                broken[seen[shifts]] = options.jumps == "cut"
         if lone.any():
             jump = f"{plural(int(lone.sum()), 'pose')} that jump and return left out (jumps={options.jumps})"
             notes.append(f"{aligned.recording.place}: {jump}")
