@@ -231,13 +231,12 @@ def _combined(
         yield robot, [wheel.with_reference(mirrored) for wheel in simple]
 
 
-def _bases(
-    recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]
-) -> Iterator[tuple[FreeFit, Hypothesis, bool]]:
-    """The fits that hypotheses transform: as recorded, by other headings, and by readings of wheels and steering.
+_Base = tuple[FreeFit, Hypothesis, bool]
+"""A fit, the hypothesis under which it was made, and True if its headings had the other sign."""
 
-    Each is given with the hypothesis under which it was made, and True if headings had the other sign.
-    """
+
+def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> Iterator[_Base]:
+    """The fits that hypotheses transform: as recorded, by other headings, and by readings of wheels and steering."""
     plain = readings.plain_hypothesis(recording.robot)
     yield fit, plain, False
     if (mirrored := recording.with_headings(-1.0).fit()) is not None:

@@ -684,17 +684,15 @@ def _made(aligned: AlignedRecording, rows: NDArray[np.intp], zero: float, poses:
     return MadeRun(run, zero, recording, scans)
 
 
-def _called(
-    run: MadeRun, samples: WheelSamples, piece: Piece, number: int | None, count: int, *, alone: bool
-) -> MadeRun:
-    """A run with its name, session, start and command. number: of the piece, if there are several; count: of runs."""
+def _called(run: MadeRun, samples: WheelSamples, piece: Piece, number: int | None, nth: int, *, alone: bool) -> MadeRun:
+    """A run with its name, session, start and command. number: of the piece, if several; nth: of the run."""
     recording, trajectory, first = run.recording, run.trajectory, float(samples.begins[0])
     changes: dict[str, Any] = {}
     if recording.numbered:
         stretch = 0
         if samples.angles is not None:  # which begin anew in each stretch
             stretch, first = int(samples.stretch[piece.part.start]), float(samples.begins[piece.part.start])
-        name = f"{count:03d}" + (f"-{piece.command}" if piece.command else "")
+        name = f"{nth:03d}" + (f"-{piece.command}" if piece.command else "")
         changes = {"id": name if alone else f"{recording.name}/{name}", "command": piece.command}
         changes |= {"session": f"{recording.name}#{stretch + 1}" if stretch else recording.name, "started_at": 0.0}
     elif number is None:

@@ -19,7 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
-from omnibench.data.delimited import missing_column, not_increasing
+from omnibench.data.delimited import Lines, missing_column, not_increasing
 from omnibench.data.parquet import OpenedTable, parquet_shape, readable, scan_table
 from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
@@ -97,9 +97,7 @@ def values_flaw(values: Array, holds: str = "it holds", way: str = "check the un
     return row, f"{holds} {rows[row][np.abs(rows[row]).argmax()]:g}, which no robot can reach; {way}"
 
 
-def refuse(
-    file: Path, rows: Sequence[int] | Rows, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()
-) -> None:
+def refuse(file: Path, rows: Lines, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()) -> None:
     """DataError for the first of some rows of a file, from 0, that is ``faulty`` (n,).
 
     what: with ``{}`` for the row's one of the values (n,).

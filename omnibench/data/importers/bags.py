@@ -113,16 +113,14 @@ class Bag:
             raise DataError(f"{self.path}: {key}: topic {chosen.name} has no messages; record it, or name another one")
         return chosen
 
-    def records(
-        self, topic: Topic, first: int | None = None, last: int | None = None
-    ) -> Iterator[tuple[int, int, Any]]:
+    def records(self, topic: Topic, between: tuple[int, int] | None = None) -> Iterator[tuple[int, int, Any]]:
         """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
 
         Each is given with its number in its topic, from 1, and the time of recording, ns, and is None if it cannot be
-        decoded. first, last: times of recording, ns, between which messages are read; numbers count from the first of
-        these.
+        decoded. between: times of recording, ns, of the first and the last message that are read; numbers count from
+        the first of these.
         """
-        number, stop = 0, None if last is None else last + 1
+        number, (first, stop) = 0, (between[0], between[1] + 1) if between else (None, None)
         with _damage_as_error(self.path):
             messages = self._reader.messages(self._connections[topic.name, topic.type], first, stop)
             for number, (_, logged, data) in enumerate(messages, 1):
@@ -428,8 +426,8 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
         places = {key: index for index, key in enumerate(keys)}
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
         with open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
-            first, last = int(logged[chosen].min()), int(logged[chosen].max())
-            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
+            between = int(logged[chosen].min()), int(logged[chosen].max())
+            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), between):
                 index = places.pop((when, topic.stamp(message, when)), None)
                 if index is not None and len(message.ranges) == scanner.rays:
                     ranges[index] = _measured(message)

@@ -78,23 +78,20 @@ def kinds() -> dict[str, Kind]:
 class Session:
     """Content of ``<session>_metadata.csv``, and the run files beside it by their numbers.
 
-    robot: its type. lengths, diameters: design values, m: L, or L1 and L2; of the wheels. angle_per_tick: of a wheel,
-    rad. starts: when each run's file begins in the session's log, s after the run's begin there.
+    group: name of the folder that holds session folders. robot: its type. lengths, diameters: design values, m: L, or
+    L1 and L2; of the wheels. angle_per_tick: of a wheel, rad. starts: when each run's file begins in the session's log,
+    s after the run's begin there.
     """
 
     file: Path
     name: str
+    group: str
     robot: str
     lengths: tuple[float, ...]
     diameters: tuple[float, ...]
     angle_per_tick: float
     starts: tuple[float, ...]
     runs: dict[int, Path]
-
-    @property
-    def group(self) -> str:
-        """The name of the folder that holds session folders."""
-        return self.file.parent.parent.name
 
     @property
     def dimensions(self) -> str:
@@ -130,7 +127,8 @@ def read_metadata(file: Path) -> Session:
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
     tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
-    return Session(file, name, robot, numbers["Li"], numbers["Di"], tick, numbers["odo_ti"], runs)
+    group = file.parent.parent.name
+    return Session(file, name, group, robot, numbers["Li"], numbers["Di"], tick, numbers["odo_ti"], runs)
 
 
 @dataclass(frozen=True, eq=False)
