@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from omnibench.check.misreadings import Explained, Recorded, search
+from omnibench.check.misreadings import Explained, search
 from omnibench.check.motion_fit import FreeFit, Windows, continuous
 from omnibench.check.source import RecordingSource, recorded
 from omnibench.data.clock_matching import ROUNDS, SEARCH, ClockMatch, Streams, fitted_together, match_clocks
@@ -112,15 +112,10 @@ class Evidence:
         return aligned
 
     @cached_property
-    def seen(self) -> Recorded:
-        """The runs that have poses, by the wheels' clock; without any, those that have positions."""
-        seen = recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
-        return replace(seen, counted=bool(self.read.options.get("ticks_per_turn")))
-
-    @cached_property
     def explained(self) -> Explained:
-        """The mistakes that explain the motion."""
-        return search(self.seen)
+        """The mistakes that explain how runs with poses move, by the wheels' clock; or else those with positions."""
+        seen = recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
+        return search(replace(seen, counted=bool(self.read.options.get("ticks_per_turn"))))
 
     @cached_property
     def looks(self) -> list[Look]:

@@ -389,8 +389,7 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
     def left(values: Array, lag: float) -> Array:
         windows = windows_by(values, lag)
         assert windows is not None  # the poses are the same
-        missing: Array = (windows.turned - windows.driven @ row_3) / deviation
-        return missing[chosen]
+        return ((windows.turned - windows.driven @ row_3) / deviation)[chosen]
 
     def solved(start: Array, lag: float) -> tuple[float, float, Array]:
         solution = least_squares(

@@ -300,5 +300,4 @@ def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array
     """
     matrices = rows @ fit.matrix @ columns
     turned = np.einsum("pij,jkl->pikl", rows**2, fit.covariance)
-    covariances: Array = np.swapaxes(columns, 1, 2)[:, None] @ turned @ columns[:, None]
-    return matrices, covariances
+    return matrices, np.swapaxes(columns, 1, 2)[:, None] @ turned @ columns[:, None]

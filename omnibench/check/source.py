@@ -77,20 +77,6 @@ class RecordingSource:
         except (DataError, ConfigError):
             return None
 
-    def read_by(self, options: Mapping[str, Any]) -> Dataset | None:
-        """The data set by other options; None if it cannot be read by them."""
-        if self.reading is None:
-            return None
-        recordings, present = self.reading
-        changed = {key: value for key, value in options.items() if self.options.get(key) != value}
-        try:
-            read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
-            if "wheel_unit" in changed:
-                recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
-            return replace(dataset_of(recordings, read, []), name=self.dataset.name)
-        except (DataError, ConfigError):
-            return None
-
     def other_quantities(self) -> Iterator[Finding]:
         """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
         if self.reading is None or not (quantities := {each.wheels.unit for each in self.reading[0]}):
@@ -105,8 +91,19 @@ class RecordingSource:
 
     def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
         """The recording, read again with the options that mend these findings; None if it cannot be read so."""
-        dataset = self.read_by(self.mended_options(findings))
-        return None if dataset is None else replace(self, dataset=dataset, findings=tuple(findings))
+        if self.reading is None:
+            return None
+        recordings, present = self.reading
+        options = self.mended_options(findings)
+        changed = {key: value for key, value in options.items() if self.options.get(key) != value}
+        try:
+            read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
+            if "wheel_unit" in changed:
+                recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
+            dataset = replace(dataset_of(recordings, read, []), name=self.dataset.name)
+        except (DataError, ConfigError):
+            return None
+        return replace(self, dataset=dataset, findings=tuple(findings))
 
     def mended_options(self, findings: Sequence[Finding]) -> dict[str, Any]:
         """The options with the changes of findings, which are relative to those by which the recording was read."""

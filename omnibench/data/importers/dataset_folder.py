@@ -164,8 +164,7 @@ def importer_of(name: str, source: Path, options: Mapping[str, Any]) -> tuple[Im
     others = DatasetOptions.model_fields.keys() - entry.options.model_fields.keys()
     again = {key: value for key, value in options.items() if key in others}
     own = {key: value for key, value in options.items() if key not in again}
-    importer: Importer = importers.create(name, entry.cls.completed(own, source))
-    return importer, again
+    return importers.create(name, entry.cls.completed(own, source)), again
 
 
 def read_dataset(importer: Importer, source: Path, again: Mapping[str, Any]) -> Dataset:
