@@ -18,10 +18,10 @@ import numpy as np
 from pydantic import Field
 
 from omnibench.data.clock_matching import median_period
-from omnibench.data.dataset import Dataset, Trajectory, make_dataset
+from omnibench.data.dataset import Dataset, Trajectory, every_second, make_dataset
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.splits import Names, divided, every_second
+from omnibench.data.splits import Names, divided
 from omnibench.errors import DataError
 from omnibench.registry import Options, importers
 from omnibench.robot.kinematics import Robot, Wheel

@@ -132,7 +132,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     for detector, hidden_by in DETECTORS:
         if hidden_by & {finding.kind for finding in others if finding.severity == "error"}:
             continue
-        findings = [*detector(evidence)]
+        findings = (*detector(evidence),)
         by_options = detector is misreadings and not read.findings and any(finding.changes for finding in findings)
         if by_options and (mended := read.mended(findings)) is not None:
             return check_recording(mended).model_copy(update={"clocks": tuple(evidence.clocks)})
@@ -142,7 +142,7 @@ def check_recording(read: RecordingSource) -> CheckReport:
     for finding in (*read.findings, *others):
         distinct.setdefault((finding.kind, finding.where), finding)
     ordered = sorted(distinct.values(), key=lambda finding: _ORDER[finding.severity])
-    findings = read.with_fixes(ordered)
+    findings = tuple(read.with_fixes(ordered))
     errors = [finding for finding in findings if finding.severity == "error"]
     kinds = {finding.kind for finding in errors}
     misread = MISREAD & {each.kind for each in ordered if each.severity == "error" and each not in read.findings}
@@ -162,14 +162,9 @@ def check_recording(read: RecordingSource) -> CheckReport:
         sentence = f"{read.dataset.name} {must}: {(typed or errors or missing)[0].what}"
         more = len(findings) - 1
         sentence += f" (and {more} more {noun_for(more, 'finding')})" if more else ""
+    command, clocks = read.command(typed), tuple(evidence.clocks)
     return CheckReport(
-        verdict=verdict,
-        needed=needed,
-        findings=tuple(findings),
-        sentence=sentence,
-        gain=gain,
-        command=read.command(typed),
-        clocks=tuple(evidence.clocks),
+        verdict=verdict, needed=needed, findings=findings, sentence=sentence, gain=gain, command=command, clocks=clocks
     )
 
 
@@ -181,11 +176,10 @@ def _read_otherwise(evidence: Evidence) -> RecordingSource | None:
     read, odd = evidence.read, odd_times(evidence.dataset)
     if not evidence.runs:
         return None
-    if not odd:
-        if evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED:
-            return None
-        if [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
-            return None
+    if not odd and (evidence.explained.mistakes or evidence.explained.unexplained <= UNRELATED):
+        return None
+    if not odd and [*faults.dead_sensors(evidence), *faults.own_odometry(evidence)]:
+        return None
     quantities: list[list[Finding]] = [[], *([finding] for finding in read.other_quantities())]
     times: list[list[Finding]] = [[finding] for finding in other_times(read.options)] if odd else [[]]
     for findings in [[*time, *quantity] for quantity in quantities for time in times]:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from omnibench.check.misreadings import Explained, Recorded, search
+from omnibench.check.misreadings import Explained, search
 from omnibench.check.motion_fit import FreeFit, Windows, continuous
 from omnibench.check.source import RecordingSource, recorded
 from omnibench.data.clock_matching import ROUNDS, SEARCH, ClockMatch, Streams, fitted_together, match_clocks
@@ -82,9 +82,21 @@ class Evidence:
 
     @cached_property
     def clocks(self) -> Sequence[ClockMatch | None]:
-        """The clocks of their references."""
+        """The clocks of their references; None where one does not show.
+
+        Of very many runs those that chance has drawn tell what all have in common; then each is matched by itself.
+        """
+        robot = self.dataset.robot
         smooth = [replace(run, poses=continuous(run.pose_times, run.poses)) for run in self.runs]
-        return clocks_of(self.dataset.robot, smooth)
+        if sum(len(run.times) for run in smooth) <= MOST_DRAWN:
+            return match_clocks(robot, [Streams.of_run(run) for run in smooth])
+        drawn = (ClockWindows.of(robot, Streams.of_run(run)) for run in drawn_runs(smooth, _TOGETHER))
+        usable = [windows for windows in drawn if windows is not None]
+        if not usable:
+            return [None] * len(smooth)
+        fitted, _ = fitted_together(usable, SEARCH)
+        tasks = [(robot, part, fitted) for part in together(smooth)]
+        return [clock for part in gathered(workers(), clocks_of_part, tasks) for clock in part]
 
     @cached_property
     def aligned(self) -> Sequence[Trajectory]:
@@ -100,15 +112,10 @@ class Evidence:
         return aligned
 
     @cached_property
-    def seen(self) -> Recorded:
-        """The runs that have poses, by the wheels' clock; without any, those that have positions."""
-        seen = recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
-        return replace(seen, counted=bool(self.read.options.get("ticks_per_turn")))
-
-    @cached_property
     def explained(self) -> Explained:
-        """The mistakes that explain the motion."""
-        return search(self.seen)
+        """The mistakes that explain how runs with poses move, by the wheels' clock; or else those with positions."""
+        seen = recorded(replace(self.dataset, trajectories=tuple(self.aligned)) if self.aligned else self.dataset)
+        return search(replace(seen, counted=bool(self.read.options.get("ticks_per_turn"))))
 
     @cached_property
     def looks(self) -> list[Look]:
@@ -125,22 +132,6 @@ class Evidence:
     def fit(self) -> FreeFit | None:
         """The matrix that fits these windows best."""
         return None if self.windows is None else self.windows.fit(self.dataset.robot.reach)
-
-
-def clocks_of(robot: Robot, runs: Sequence[Trajectory]) -> list[ClockMatch | None]:
-    """The clock of every run's reference; None where it does not show.
-
-    Of very many runs those that chance has drawn tell what all have in common, and then each is matched by itself.
-    """
-    if sum(len(run.times) for run in runs) <= MOST_DRAWN:
-        return match_clocks(robot, [Streams.of_run(run) for run in runs])
-    drawn = (ClockWindows.of(robot, Streams.of_run(run)) for run in drawn_runs(runs, _TOGETHER))
-    usable = [windows for windows in drawn if windows is not None]
-    if not usable:
-        return [None] * len(runs)
-    fitted, _ = fitted_together(usable, SEARCH)
-    tasks = [(robot, part, fitted) for part in together(runs)]
-    return [clock for part in gathered(workers(), clocks_of_part, tasks) for clock in part]
 
 
 def clocks_of_part(task: tuple[Robot, Sequence[Trajectory], Sequence[Array]], _: Reporter) -> list[ClockMatch | None]:
@@ -189,9 +180,9 @@ def _look(robot: Robot, run: Trajectory, of_wheels: float, of_reference: float) 
         return tuple((ends - begins)[driven > _DRIVEN].tolist())
 
     fast = int((np.abs(run.rates) * robot.radii > _FASTEST).any(axis=1).sum())
-    wheel_gaps = gaps(edges, of_wheels)
+    of_run = run.id, len(run.times), fast, gaps(edges, of_wheels)
     if not run.has_poses:
-        return Look(run.id, len(run.times), fast, wheel_gaps)
+        return Look(*of_run)
     # Stretches of equal poses, from first to last.
     moves = np.diff(run.poses, axis=0)
     bounds = np.flatnonzero(np.concatenate([[True], np.abs(moves).max(axis=1) > SAME, [True]]))
@@ -203,25 +194,19 @@ def _look(robot: Robot, run: Trajectory, of_wheels: float, of_reference: float) 
     seen = _lengths(robot, run.poses[last] - run.poses[first])
     still = long & (wheels > _DRIVEN) & (seen < _STILL * wheels)
     seen_ways = np.append(0.0, np.cumsum(_lengths(robot, moves)))
-    return Look(
-        run.id,
-        len(run.times),
-        fast,
-        wheel_gaps,
-        gaps(run.pose_times, of_reference),
-        float(seconds[still].sum()),
-        np.abs(run.rates).T @ np.diff(run.times, prepend=0.0),
-        _expected_angles(robot, run),
-        None if run.steering is None else np.array([run.steering.min(axis=0), run.steering.max(axis=0)]),
-        None if run.steering is None else _bends(robot, run, seen_ways),
-        _at_once(edges, ways) and _at_once(run.pose_times, seen_ways),
-    )
+    counted, expected = np.abs(run.rates).T @ np.diff(run.times, prepend=0.0), _expected_angles(robot, run)
+    steering = bends = None
+    if run.steering is not None:
+        steering = np.array([run.steering.min(axis=0), run.steering.max(axis=0)])
+        bends = _bends(robot, run, seen_ways)
+    at_once = _at_once(edges, ways) and _at_once(run.pose_times, seen_ways)
+    reference_gaps, standing = gaps(run.pose_times, of_reference), float(seconds[still].sum())
+    return Look(*of_run, reference_gaps, standing, counted, expected, steering, bends, at_once)
 
 
 def _lengths(robot: Robot, motions: Array) -> Array:
     """Lengths (...) of motions (..., 3), m; turning counts at the robot's reach."""
-    lengths: Array = np.hypot(motions[..., 0], motions[..., 1]) + robot.reach * np.abs(motions[..., 2])
-    return lengths
+    return np.hypot(motions[..., 0], motions[..., 1]) + robot.reach * np.abs(motions[..., 2])
 
 
 def _bends(robot: Robot, run: Trajectory, ways: Array) -> Array:
@@ -231,8 +216,7 @@ def _bends(robot: Robot, run: Trajectory, ways: Array) -> Array:
     rolled = np.append(0.0, np.cumsum(run.rates.mean(axis=1) * np.diff(run.times, prepend=0.0)))
     rolling = np.sign(np.diff(np.interp(run.pose_times, np.append(0.0, run.times), rolled)))
     signed = np.append(0.0, np.cumsum(np.diff(run.poses[:, 2]) * rolling))
-    bends: Array = np.diff(np.interp(np.arange(0.0, ways[-1], length), ways, signed))
-    return bends
+    return np.diff(np.interp(np.arange(0.0, ways[-1], length), ways, signed))
 
 
 def _expected_angles(robot: Robot, run: Trajectory) -> Array:

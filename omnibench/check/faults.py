@@ -17,11 +17,11 @@ from scipy.special import ndtr, stdtrit
 from omnibench.check.evidence import SAME, Evidence, looks_of, pose_period
 from omnibench.check.hypotheses import POSITION_UNITS, another_zero, wheels_in_words
 from omnibench.data.dataset import Trajectory
-from omnibench.data.finding import Finding, Kind, Severity, error, findings_of
-from omnibench.data.references import KINDS, UNITS, ReferenceKind, References
+from omnibench.data.finding import CounterRestart, Finding, Kind, Severity, error
+from omnibench.data.references import KINDS, UNITS, ReferenceKind
 from omnibench.data.spoiled_references import follows_the_wheels, reference_jumps
 from omnibench.data.stored import count_drawn, drawn_runs, median_period
-from omnibench.robot.kinematics import Array, CarDrive
+from omnibench.robot.kinematics import CarDrive
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural, some
 
@@ -79,7 +79,7 @@ def runs_in_words(runs: Sequence[str], every: int) -> str:
 
 def notes(evidence: Evidence) -> Iterator[Finding]:
     """Restarts of counters that the importer has mended, and a note where not all runs are looked at together."""
-    restarts = [each.what for each in findings_of(evidence.dataset.warnings) if each.kind == "counter_restart"]
+    restarts = [warning for warning in evidence.dataset.warnings if isinstance(warning, CounterRestart)]
     if restarts:
         what = "; ".join(restarts[:_MOST_NOTES])
         what += f"; and {len(restarts) - _MOST_NOTES} more such notes" if len(restarts) > _MOST_NOTES else ""
@@ -252,11 +252,11 @@ def jumps(evidence: Evidence) -> Iterator[Finding]:
     robot, standing = evidence.dataset.robot, {look.run for look in evidence.looks if look.standing}
     runs = [run for run in evidence.aligned if run.id not in standing]
     found = {run.id: reference_jumps(robot, run.log(run.pose_times), run.poses) for run in runs}
-    lone, shifts = ([run for run, each in found.items() if len(getattr(each, kind))] for kind in ("lone", "shifts"))
-    poses = sum(len(each.lone) for each in found.values())
+    lone, shifts = ([run for run, each in found.items() if len(each[kind])] for kind in (0, 1))
+    poses = sum(len(of_run) for of_run, _ in found.values())
     if shifts:
         beside = f", and {plural(poses, 'lone pose')} jump and return" if lone else ""
-        count = plural(sum(len(each.shifts) for each in found.values()), "time")
+        count = plural(sum(len(of_run) for _, of_run in found.values()), "time")
         what = f"the reference jumps {count} for good, farther than the wheels drive{beside}"
         where = f"poses of {runs_in_words(list(dict.fromkeys([*shifts, *lone])), len(runs))}"
         yield error("reference_jump", what, where, {"jumps": "cut"})
@@ -336,10 +336,24 @@ def odd_references(evidence: Evidence) -> Iterator[Finding]:
     ratios: dict[ReferenceKind, list[float]] = {kind: [] for kind in KINDS}
     model = OdometryModel.of_design(evidence.dataset.robot, "arc")
     for run in evidence.dataset.trajectories:
-        if run.references is None or not len(run.references):
+        if (references := run.references) is None or not len(references):
             continue
-        sizes, driven = _sizes(model, run, run.references)
-        for kind, size, expected in zip(run.references.kinds.tolist(), sizes, driven, strict=True):
+        # Magnitudes of what was measured and of the same by the design; positions and compass headings since the first.
+        stamps, places = np.unique([references.t0, references.t1], return_inverse=True)
+        log = run.log(stamps)
+        first, last = model.poses([log])[0][places.reshape(2, -1)]  # (R, 3), poses at the begin and at the end of each
+        begin, end = model.lengths([log])[0][places.reshape(2, -1)]
+        measured = references.values.copy()
+        for in_fixed_frame in ("position", "heading"):
+            chosen = references.fixed_frame & (references.kinds == in_fixed_frame)
+            if chosen.any():
+                measured[chosen] -= measured[chosen][0]
+                measured[np.flatnonzero(chosen)[0]] = np.nan
+                first[chosen] = last[chosen][0]
+        sizes = np.where(references.planar, np.hypot(measured[:, 0], measured[:, 1]), np.abs(measured[:, 0]))
+        moved, kinds = last - first, [references.kinds == "distance", references.planar]
+        driven = np.select(kinds, [end - begin, np.hypot(moved[:, 0], moved[:, 1])], np.abs(moved[:, 2]))
+        for kind, size, expected in zip(references.kinds.tolist(), sizes, driven, strict=True):
             if expected > _LEAST[UNITS[kind]] and np.isfinite(size):
                 ratios[kind].append(size / expected)
     for kind, values in ratios.items():
@@ -351,29 +365,6 @@ def odd_references(evidence: Evidence) -> Iterator[Finding]:
                 where, option = f"references of kind {kind}", _OPTIONS[must]
                 fix = "write these references in m and rad, as the poses are, and import again" if evidence.runs else ""
                 yield error(option, what, where, {} if evidence.runs else {option: unit}, fix=fix)
-
-
-def _sizes(model: OdometryModel, run: Trajectory, references: References) -> tuple[Array, Array]:
-    """Magnitudes (R,) of what was measured and of the same by a model; positions and compass headings since the first.
-
-    NaN for the first of those.
-    """
-    stamps, places = np.unique([references.t0, references.t1], return_inverse=True)
-    log = run.log(stamps)
-    first, last = model.poses([log])[0][places.reshape(2, -1)]  # (R, 3), poses at the begin and at the end of each
-    begin, end = model.lengths([log])[0][places.reshape(2, -1)]
-    values = references.values.copy()
-    for kind in ("position", "heading"):
-        chosen = references.fixed_frame & (references.kinds == kind)
-        if chosen.any():
-            values[chosen] -= values[chosen][0]
-            values[np.flatnonzero(chosen)[0]] = np.nan
-            first[chosen] = last[chosen][0]
-    size = np.where(references.planar, np.hypot(values[:, 0], values[:, 1]), np.abs(values[:, 0]))
-    moved = last - first
-    kinds = [references.kinds == "distance", references.planar]
-    expected = np.select(kinds, [end - begin, np.hypot(moved[:, 0], moved[:, 1])], np.abs(moved[:, 2]))
-    return size, expected
 
 
 def early_references(evidence: Evidence) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from omnibench.check.motion_fit import DesignDistance, FreeFit, Windows
 from omnibench.data.finding import Finding, Kind, error
-from omnibench.data.recording import corrected_robot
+from omnibench.data.recording_options import corrected_robot
 from omnibench.errors import ConfigError
 from omnibench.robot.kinematics import Array, CarDrive, Drive, Robot, interpolated, rotation
 from omnibench.robot.odometry import WheelLog
@@ -291,7 +291,13 @@ def design_hypotheses(robot: Robot, fit: FreeFit) -> Iterator[Hypothesis]:
     if (exchanged_rollers := _corrected(robot, rollers)) is not None:
         words = "the rollers of the wheels in robot.yaml look exchanged: those of left and right wheels"
         yield wrong("design_rollers", words, {"wheels": rollers}, exchanged_rollers, _WHEEL)
-    if (mistake := another_mount(robot, _tracked_point(robot, fit))) is not None:
+    # Offset (2,), m, of the tracked point from its place in the design: one at (x, y) has rows k1 - y k3 and k2 + x k3.
+    design, turn = robot.inverse_kinematic_matrix, fit.matrix[2]
+    weights = 1 / np.maximum(np.diag(fit.covariance[0]), 1e-300)
+    whole = float(weights @ turn**2)
+    off = np.array([weights @ ((fit.matrix[1] - design[1]) * turn), -(weights @ ((fit.matrix[0] - design[0]) * turn))])
+    offset = off / whole if whole and np.isfinite(whole) else np.full(2, np.nan)
+    if (mistake := another_mount(robot, offset)) is not None:
         other = corrected_robot(robot, {}, mistake.changes["mount"])
         yield replace(plain, cost=_FITTED, mistakes=(mistake,), robot=other)
 
@@ -327,18 +333,6 @@ def _corrected(robot: Robot, wheels: Mapping[str, Mapping[str, Any]]) -> Robot |
         return other if np.isfinite(other.inverse_kinematic_matrix).all() else None
     except (ConfigError, np.linalg.LinAlgError):
         return None
-
-
-def _tracked_point(robot: Robot, fit: FreeFit) -> Array:
-    """Offset (2,), m, of the tracked point from its place in the design, by the matrix; NaN if nothing turns.
-
-    A point at (x, y) of the robot has rows k1 - y k3 and k2 + x k3.
-    """
-    design, turn = robot.inverse_kinematic_matrix, fit.matrix[2]
-    weights = 1 / np.maximum(np.diag(fit.covariance[0]), 1e-300)
-    whole = float(weights @ turn**2)
-    off = np.array([weights @ ((fit.matrix[1] - design[1]) * turn), -(weights @ ((fit.matrix[0] - design[0]) * turn))])
-    return off / whole if whole and np.isfinite(whole) else np.full(2, np.nan)
 
 
 def steering_readings(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Array]) -> Iterator[Hypothesis]:
@@ -395,8 +389,7 @@ def _fitted_steering(robot: Robot, logs: Sequence[WheelLog], poses: Sequence[Arr
     def left(values: Array, lag: float) -> Array:
         windows = windows_by(values, lag)
         assert windows is not None  # the poses are the same
-        missing: Array = (windows.turned - windows.driven @ row_3) / deviation
-        return missing[chosen]
+        return ((windows.turned - windows.driven @ row_3) / deviation)[chosen]
 
     def solved(start: Array, lag: float) -> tuple[float, float, Array]:
         solution = least_squares(

@@ -98,9 +98,8 @@ class Recorded:
     def in_degrees(self) -> Recorded:
         """With headings that were recorded in degrees."""
         as_read = self.as_read or self.poses
-        headings = [np.radians(np.unwrap(poses[:, 2], period=360.0)) for poses in as_read]
-        pairs = zip(self.poses, headings, strict=True)
-        return replace(self, poses=[np.column_stack([poses[:, :2], turned]) for poses, turned in pairs])
+        pairs = [(poses[:, :2], np.radians(np.unwrap(poses[:, 2], period=360.0))) for poses in as_read]
+        return replace(self, poses=[np.column_stack(pair) for pair in pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,20 +118,6 @@ class Explained:
 
 
 @dataclass(frozen=True, eq=False)
-class _Base:
-    """A fit, the mistakes under which it was made, and their cost.
-
-    flipped: with headings of the other sign. exclusive: no mistake of the reference or the design is tried beside it.
-    """
-
-    fit: FreeFit
-    mistakes: tuple[Finding, ...] = ()
-    cost: float = 0.0
-    flipped: bool = False
-    exclusive: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class _Scored:
     """Mistakes by Eq. (1). remaining: share of the way or of the turns that no matrix explains."""
 
@@ -143,21 +128,9 @@ class _Scored:
     remaining: float
     mistakes: tuple[Finding, ...]
 
-    @property
-    def usual(self) -> bool:
-        """True if the motion is as near the design as sound recordings are, and the wheels explain it."""
-        agrees = self.distance < _SUSPICIOUS and self.contradiction < _CONTRADICTING
-        return agrees and self.remaining < UNRELATED
-
-    def explains(self, present: _Scored) -> bool:
-        """True if it is likelier than no mistake, and leaves hardly anything of what made the recording suspicious."""
-        return (
-            bool(self.mistakes)
-            and self.score <= present.score - _BETTER
-            and self.remaining < UNRELATED
-            and self.distance <= max(_REMAINS * present.distance, _SUSPICIOUS)
-            and self.contradiction <= max(_REMAINS * present.contradiction, _CONTRADICTING)
-        )
+    def leaves(self, distance: float, contradiction: float) -> bool:
+        """True if it leaves no larger distance and contradiction, and the wheels explain the motion."""
+        return self.remaining < UNRELATED and self.distance <= distance and self.contradiction <= contradiction
 
 
 def search(recording: Recorded) -> Explained:
@@ -176,11 +149,15 @@ def search(recording: Recorded) -> Explained:
     suspicious = distance >= _SUSPICIOUS or contradiction >= _CONTRADICTING
     scored = sorted(_scores(some, fit), key=lambda each: each.score)
     present = next(each for each in scored if not each.mistakes)
-    best = scored[0] if scored[0].explains(present) else None
-    if best is None and suspicious:
+    usual = _SUSPICIOUS, _CONTRADICTING
+    hardly = np.maximum(usual, (_REMAINS * present.distance, _REMAINS * present.contradiction)).tolist()
+    best, likelier = None, scored[0].mistakes and scored[0].score <= present.score - _BETTER
+    if likelier and scored[0].leaves(*hardly):
+        best = scored[0]
+    elif suspicious:
         # Something is wrong anyway: a single mistake that leaves nothing of it need only pay for itself.
         single = [each for each in scored[: scored.index(present)] if len(each.mistakes) == 1]
-        best = next((each for each in single if each.usual), None)
+        best = next((each for each in single if each.leaves(*usual)), None)
     if best is None:
         return Explained(unexplained=present.remaining, far=suspicious, fit=fit)
     near = [
@@ -207,15 +184,16 @@ def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
     weight, best = min(fit.windows / _CORRELATED, _MOST_WEIGHED), math.inf
     every = list(readings.wheel_hypotheses(recording.robot, counted=recording.counted))
     transforming = [hypothesis for hypothesis in every if hypothesis.reading is None]
-    for base in _bases(recording, fit, [hypothesis for hypothesis in every if hypothesis.reading is not None]):
-        residual, remaining = weight * math.log(max(base.fit.share, 1e-9)), float(base.fit.unexplained.min())
+    fitted = [hypothesis for hypothesis in every if hypothesis.reading is not None]
+    for free, base, flipped in _bases(recording, fit, fitted):
+        residual, remaining = weight * math.log(max(free.share, 1e-9)), float(free.unexplained.min())
         if residual + weight * math.log(_USUAL) > best + _ALIKE:
             continue
-        for robot, hypotheses in _combined(recording.robot, base, transforming):
+        for robot, hypotheses in _combined(recording.robot, free, base, transforming, flipped=flipped):
             far = DesignDistance(robot)
             rows, columns = (np.array([getattr(each, name) for each in hypotheses]) for name in ("rows", "columns"))
-            squared = far.squared(*transformed(base.fit, rows, columns))
-            against = far.contradictions(base.fit.gram, columns)
+            squared = far.squared(*transformed(free, rows, columns))
+            against = far.contradictions(free.gram, columns)
             scores = base.cost + residual + squared + weight * np.log(np.hypot(against, _USUAL))
             numbers = zip(hypotheses, scores.tolist(), squared.tolist(), against.tolist(), strict=True)
             for hypothesis, score, distance, share in numbers:
@@ -224,15 +202,18 @@ def _scores(recording: Recorded, fit: FreeFit) -> Iterator[_Scored]:
                 yield _Scored(score + hypothesis.cost, cost, distance, share, remaining, mistakes)
 
 
-def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterator[tuple[Robot, Sequence[Hypothesis]]]:
+def _combined(
+    robot: Robot, fit: FreeFit, base: Hypothesis, wheels: Sequence[Hypothesis], *, flipped: bool
+) -> Iterator[tuple[Robot, Sequence[Hypothesis]]]:
     """Mistakes of the wheels, and of the reference or the robot's file with those, by the design that is meant.
 
-    Never more than three are made at once.
+    base: under which the fit was made; beside a reading of the wheels nothing else is tried. Never more than three
+    mistakes are made at once.
     """
     simple = [wheel for wheel in wheels if wheel.cost <= _SIMPLE]
-    if not base.flipped:
+    if not flipped:
         yield robot, wheels
-        if base.exclusive:
+        if base.reading is not None:
             return
         for unit in readings.position_units():
             yield robot, [wheel.with_reference(unit) for wheel in simple]
@@ -240,34 +221,40 @@ def _combined(robot: Robot, base: _Base, wheels: Sequence[Hypothesis]) -> Iterat
             wheel.with_reference(reference)
             for wheel in simple
             if not wheel.mistakes or wheel.mistakes[0].kind != "wheels_swapped"
-            if (reference := readings.turned_reference(robot, base.fit, wheel.columns)) is not None
+            if (reference := readings.turned_reference(robot, fit, wheel.columns)) is not None
         ]
         if turned:
             yield robot, turned
-        for hypothesis in () if base.mistakes else readings.design_hypotheses(robot, base.fit):
+        for hypothesis in () if base.mistakes else readings.design_hypotheses(robot, fit):
             yield hypothesis.robot or robot, [hypothesis]
-    for mirrored in readings.reference_hypotheses(base.flipped):
+    for mirrored in readings.reference_hypotheses(flipped):
         yield robot, [wheel.with_reference(mirrored) for wheel in simple]
+
+
+_Base = tuple[FreeFit, Hypothesis, bool]
+"""A fit, the hypothesis under which it was made, and True if its headings had the other sign."""
 
 
 def _bases(recording: Recorded, fit: FreeFit, wheels: Sequence[Hypothesis]) -> Iterator[_Base]:
     """The fits that hypotheses transform: as recorded, by other headings, and by readings of wheels and steering."""
-    yield _Base(fit)
-    if (flipped := recording.with_headings(-1.0).fit()) is not None:
-        yield _Base(flipped, flipped=True)
+    plain = readings.plain_hypothesis(recording.robot)
+    yield fit, plain, False
+    if (mirrored := recording.with_headings(-1.0).fit()) is not None:
+        yield mirrored, plain, True
     # Headings in rad hardly begin beyond a whole turn.
     beyond = any(abs(float(poses[0, 2])) > 1.01 * _TURN for poses in recording.poses)
-    degrees, cost = recording.in_degrees(), 0.0 if beyond else _IN_DEGREES
-    read_as: list[tuple[Recorded, tuple[Finding, ...], float]] = [(recording, (), 0.0)]
+    in_degrees = replace(plain, mistakes=(readings.IN_DEGREES,), cost=0.0 if beyond else _IN_DEGREES)
+    degrees, read_as = recording.in_degrees(), [(recording, plain)]
     for factor in (1.0, -1.0):
-        if (base := degrees.with_headings(factor).fit()) is not None:
-            yield _Base(base, (readings.IN_DEGREES,), cost, flipped=factor < 0)
-            if factor > 0 and (beyond or base.unexplained[1] < fit.unexplained[1] / 2):
-                read_as.append((degrees, (readings.IN_DEGREES,), cost))
-    for read, mistakes, more in read_as:
+        if (other := degrees.with_headings(factor).fit()) is not None:
+            yield other, in_degrees, factor < 0
+            if factor > 0 and (beyond or other.unexplained[1] < fit.unexplained[1] / 2):
+                read_as.append((degrees, in_degrees))
+    for read, base in read_as:
         for hypothesis in (*wheels, *readings.steering_readings(read.robot, read.logs, read.poses)):
-            if (base := read.meant(hypothesis).fit()) is not None:
-                yield _Base(base, (*mistakes, *hypothesis.mistakes), more + hypothesis.cost, exclusive=True)
+            if (other := read.meant(hypothesis).fit()) is not None:
+                mistakes, cost = (*base.mistakes, *hypothesis.mistakes), base.cost + hypothesis.cost
+                yield other, replace(hypothesis, mistakes=mistakes, cost=cost), False
 
 
 def _search_sparse(recording: Recorded) -> Explained:
@@ -280,7 +267,16 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         contradicting = _contradicting(recording)
         return moments.off_centre() if positions and not contradicting else Explained(contradicting)
-    hypotheses = list(_sparse_hypotheses(recording))
+    # Mistakes of the wheels, one of them or none, each with every unit of the positions. Factors of rates and radii
+    # that a calibration is for are left out: sparse poses do not tell them from another design.
+    wheels = []
+    for wheel in readings.wheel_hypotheses(robot, counted=recording.counted):
+        scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
+        small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
+        if wheel.reading is None and not small:
+            wheels.append(wheel)
+    simple = [wheel for wheel in wheels if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit"]
+    hypotheses = [*wheels, *(wheel.with_reference(unit) for unit in readings.position_units() for wheel in simple)]
     if positions:
         hypotheses.append(plain.with_reference(readings.mirrored_positions()))
     scored = []
@@ -320,25 +316,6 @@ def _contradicting(recording: Recorded) -> tuple[Finding, ...]:
     shares = far.contradictions(gram, np.array([hypothesis.columns for hypothesis in steering]))
     best = int(shares.argmin())
     return steering[best].mistakes if shares[best] < _EXPLAINED * present else ()
-
-
-def _sparse_hypotheses(recording: Recorded) -> Iterator[Hypothesis]:
-    """Mistakes of the wheels, one of them or none, each with every unit of the positions.
-
-    Factors of rates and radii that a calibration is for are left out: sparse poses do not tell them from another
-    design.
-    """
-    wheels = []
-    for wheel in readings.wheel_hypotheses(recording.robot, counted=recording.counted):
-        scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)
-        small = scaled and bool((factors > 1 / _LEAST_FACTOR).all() and (factors < _LEAST_FACTOR).all())
-        if wheel.reading is None and not small:
-            wheels.append(wheel)
-    yield from wheels
-    for unit in readings.position_units():
-        for wheel in wheels:
-            if not wheel.mistakes or wheel.mistakes[0].kind == "wheel_unit":
-                yield wheel.with_reference(unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,10 +465,8 @@ class _Moments:
         places.append((self.poses[:, 0] + 1j * self.poses[:, 1])[None])
         driven, seen = (place - (np.add.reduceat(place, firsts, axis=1) / counts)[:, run] for place in places)
         angles = np.angle(np.add.reduceat(driven * seen.conj(), firsts, axis=1))
-        off: Complex = driven - seen * np.exp(1j * angles)[:, run]
-        return off
+        return driven - seen * np.exp(1j * angles)[:, run]
 
     def _turns(self, headings: Array) -> Array:
         """Turns (..., S) since the moment before from headings since the start."""
-        turns: Array = headings - np.where(self.first, 0.0, np.roll(headings, 1, axis=-1))
-        return turns
+        return headings - np.where(self.first, 0.0, np.roll(headings, 1, axis=-1))

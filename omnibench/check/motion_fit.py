@@ -136,8 +136,7 @@ class Windows:
         off = off + reach * np.abs(self.turned - self.driven @ fit.matrix[2])
         whole = np.abs(self.moved) + reach * np.abs(self.turned)
         left, every = (np.bincount(self.run, each, runs) for each in (off, whole))
-        shares: Array = left / np.maximum(every, 1e-9)
-        return shares
+        return left / np.maximum(every, 1e-9)
 
     def steering_zero(self) -> tuple[float, float]:
         """The angle, rad, that a car's steering angles lack, and its standard error.
@@ -223,8 +222,7 @@ def _covariance(columns: Complex, residuals: Array | Complex, weights: Array) ->
     values, vectors = np.linalg.eigh(normal)
     values = np.maximum(values, 1e-8 * max(float(values[-1]), 1e-300))
     variance = _CORRELATED_WINDOWS * float(weights @ np.abs(residuals) ** 2) / max(float(weights.sum()), 1.0)
-    covariance: Array = (vectors / values) @ vectors.T * variance
-    return covariance
+    return (vectors / values) @ vectors.T * variance
 
 
 # Standard deviations by which robots differ from their designs, as shares (chosen; OptiOdom's tricycle is 7 % off in
@@ -276,8 +274,7 @@ class DesignDistance:
             whole[:, block, block] = covariances[:, row]
         off = (matrices - self.design).reshape(count, -1) * self._units
         whole = whole * np.outer(self._units, self._units) + self._allowed
-        squared: Array = np.einsum("pi,pi->p", off, np.linalg.solve(whole, off[..., None])[..., 0])
-        return squared
+        return np.einsum("pi,pi->p", off, np.linalg.solve(whole, off[..., None])[..., 0])
 
     def of(self, fit: FreeFit) -> float:
         """d^2 of one fit."""
@@ -292,8 +289,7 @@ class DesignDistance:
         grams = meant @ gram @ np.swapaxes(meant, 1, 2)
         whole = np.maximum(np.trace(grams, axis1=1, axis2=2), 1e-300)
         outside = np.einsum("ij,pjk,ik->p", self._outside, grams, self._outside)
-        shares: Array = np.sqrt(np.maximum(outside, 0.0) / whole)
-        return shares
+        return np.sqrt(np.maximum(outside, 0.0) / whole)
 
 
 def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array]:
@@ -304,5 +300,4 @@ def transformed(fit: FreeFit, rows: Array, columns: Array) -> tuple[Array, Array
     """
     matrices = rows @ fit.matrix @ columns
     turned = np.einsum("pij,jkl->pikl", rows**2, fit.covariance)
-    covariances: Array = np.swapaxes(columns, 1, 2)[:, None] @ turned @ columns[:, None]
-    return matrices, covariances
+    return matrices, np.swapaxes(columns, 1, 2)[:, None] @ turned @ columns[:, None]

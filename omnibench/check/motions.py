@@ -52,12 +52,8 @@ def motion_kinds(twists: Array, robot: Robot) -> Kinds:
         kinds |= {f"on the spot to the {side}": spot & to_side for side, to_side in sides.items()}
     ahead = moving & ~spot
     kinds |= {"forward": ahead & (np.abs(angle) <= _SECTOR), "backward": ahead & (np.abs(angle) >= 180 - _SECTOR)}
-    if len(robot.motions) == 3:
-        kinds |= {
-            "sideways to the left": ahead & (np.abs(angle - 90) <= _SECTOR),
-            "sideways to the right": ahead & (np.abs(angle + 90) <= _SECTOR),
-        }
-    return kinds
+    sideways = zip(_SIDES, (90.0, -90.0), strict=True) if len(robot.motions) == 3 else ()
+    return kinds | {f"sideways to the {side}": ahead & (np.abs(angle - middle) <= _SECTOR) for side, middle in sideways}
 
 
 def turning(kinds: Kinds, side: str) -> NDArray[np.bool_]:

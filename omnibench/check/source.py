@@ -20,7 +20,8 @@ from omnibench.config import as_yaml, validate
 from omnibench.data.dataset import Dataset
 from omnibench.data.finding import Finding, error
 from omnibench.data.importers.dataset_folder import DatasetOptions, importer_of, read_dataset, recordings_of
-from omnibench.data.recording import Recording, ReferenceOptions, quantity_of
+from omnibench.data.recording import Recording
+from omnibench.data.recording_options import ReferenceOptions, quantity_of
 from omnibench.data.runs import dataset_of
 from omnibench.data.storage import dataset_folders, in_few_words, load_dataset
 from omnibench.data.stored import median_period
@@ -76,20 +77,6 @@ class RecordingSource:
         except (DataError, ConfigError):
             return None
 
-    def read_by(self, options: Mapping[str, Any]) -> Dataset | None:
-        """The data set by other options; None if it cannot be read by them."""
-        if self.reading is None:
-            return None
-        recordings, present = self.reading
-        changed = {key: value for key, value in options.items() if self.options.get(key) != value}
-        try:
-            read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
-            if "wheel_unit" in changed:
-                recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
-            return replace(dataset_of(recordings, read, []), name=self.dataset.name)
-        except (DataError, ConfigError):
-            return None
-
     def other_quantities(self) -> Iterator[Finding]:
         """Findings that the wheels are positions, increments or rates, whichever they are not read as."""
         if self.reading is None or not (quantities := {each.wheels.unit for each in self.reading[0]}):
@@ -104,8 +91,19 @@ class RecordingSource:
 
     def mended(self, findings: Sequence[Finding]) -> RecordingSource | None:
         """The recording, read again with the options that mend these findings; None if it cannot be read so."""
-        dataset = self.read_by(self.mended_options(findings))
-        return None if dataset is None else replace(self, dataset=dataset, findings=tuple(findings))
+        if self.reading is None:
+            return None
+        recordings, present = self.reading
+        options = self.mended_options(findings)
+        changed = {key: value for key, value in options.items() if self.options.get(key) != value}
+        try:
+            read = validate(type(present), {**present.model_dump(exclude_unset=True), **changed}, "options")
+            if "wheel_unit" in changed:
+                recordings = [replace(each, wheels=replace(each.wheels, unit=read.wheel_unit)) for each in recordings]
+            dataset = replace(dataset_of(recordings, read, []), name=self.dataset.name)
+        except (DataError, ConfigError):
+            return None
+        return replace(self, dataset=dataset, findings=tuple(findings))
 
     def mended_options(self, findings: Sequence[Finding]) -> dict[str, Any]:
         """The options with the changes of findings, which are relative to those by which the recording was read."""
@@ -163,7 +161,7 @@ class RecordingSource:
 def _of_runs(dataset: Dataset, given: Mapping[str, Any]) -> tuple[list[Recording], ReferenceOptions]:
     """The runs of a data set as recordings."""
     options = DatasetOptions(robot=dataset.robot, **given)
-    return recordings_of(dataset.trajectories, dataset.robot, None, options), options
+    return recordings_of(replace(dataset, scans=None), options), options
 
 
 def read_source(
@@ -180,9 +178,8 @@ def read_source(
     places = dataset_folders(source)
     if len(places) > 1:
         if form or settings:
-            raise ConfigError(
-                f"{places[0]} and {len(places) - 1} more: an importer reads one source; import each by itself"
-            )
+            several = f"{places[0]} and {len(places) - 1} more"
+            raise ConfigError(f"{several}: an importer reads one source; import each by itself")
         return replace(of_dataset(load_dataset(places)), places=tuple(places))
     (source,) = places
     check_source(source)

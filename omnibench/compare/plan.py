@@ -20,8 +20,8 @@ import numpy as np
 
 from omnibench.compare import config as choices
 from omnibench.compare.config import AS_RECORDED, CalibratorEntry, CompareConfig, RegimeChoice
-from omnibench.data.dataset import SPLITS, Dataset, Trajectory
-from omnibench.data.splits import repetitions, training_split
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory, repetitions
+from omnibench.data.splits import training_split
 from omnibench.errors import ConfigError, DataError, OmnibenchError, PluginError, nearest
 from omnibench.fit.calibrator import refusal_of
 from omnibench.fit.geometry import GeometryLimits

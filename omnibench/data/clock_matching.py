@@ -260,9 +260,7 @@ class Windows:
         shares[within.sum(axis=1) < max(_FEWEST, within.shape[1] / 2)] = np.inf
         return shares
 
-    def _system(
-        self, fitted: Sequence[Array], clock: Clock, deviations: Array | None = None
-    ) -> tuple[Array, Array, Array]:
+    def _system(self, fitted: Sequence[Array], clock: Clock, deviations: Array | None = None) -> tuple[Array, ...]:
         """Residuals (2, W) in standard deviations (2,), Huber's weights, and derivatives (P, 2, W) of what is shown.
 
         deviations: by default those of what is left. The derivatives are by the gains of both channels in this run,
@@ -406,9 +404,8 @@ def _solved(columns: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
     for _ in range(2):
         sizes = np.abs(wanted - (columns @ solution[..., None])[..., 0])
         deviation = 1.4826 * _median(sizes, counted)[..., None]
-        weights = np.where(
-            deviation > 0, counted * np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300)), weights
-        )
+        robust = counted * np.minimum(1.0, _HUBER * deviation / np.maximum(sizes, 1e-300))
+        weights = np.where(deviation > 0, robust, weights)
         solution = _weighted(columns, wanted, weights)
     return solution
 

@@ -475,13 +475,12 @@ def checked(dataset: Dataset) -> Dataset:
         headings, ambiguous, standing = recorded, [], []  # in other units runs seem to move too far
     else:
         contradicted = []
+    standing = standing if len(standing) < moving else []  # in all runs the wheels are another robot's
     late = [run.id for run in runs if run.pose_times[-1] > run.samples.end * (1 + 1.5 / run.samples.count)]
     concerned = {
         "headings of {} turn otherwise than the wheels, so that all stay as they were recorded": contradicted,
         "headings of {} may be unwrapped wrongly (reference too sparse)": [runs[index].id for index in ambiguous],
-        "the reference moves in {} though no wheel turns, which spoils every fit; leave them out": (
-            standing if len(standing) < moving else []
-        ),
+        "the reference moves in {} though no wheel turns, which spoils every fit; leave them out": standing,
         "{} with reference poses after the last wheel sample": late,
     }
     warnings = [

@@ -34,10 +34,8 @@ def extrapolation_warning(calibration: Calibration, runs: Sequence[Trajectory]) 
     commands = sorted(worst, key=lambda command: -worst[command][0])
     words, effects = domain.in_words(worst[commands[0]][1]), [term.name for term in calibration.effects]
     consequence = extrapolation_consequence(effects, fading=calibration.plain is not None)
-    return (
-        f"{count} of {len(runs)} runs drive motions that calibration {calibration.name!r} was not fitted to "
-        f"({some(commands, _NAMED)}), such as {words}: {consequence}"
-    )
+    what = f"{count} of {len(runs)} runs drive motions that calibration {calibration.name!r} was not fitted to"
+    return f"{what} ({some(commands, _NAMED)}), such as {words}: {consequence}"
 
 
 def share_outside(calibration: Calibration, runs: Sequence[Trajectory]) -> float | None:

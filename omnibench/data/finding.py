@@ -1,8 +1,8 @@
-"""A finding about a recording: what is wrong, where, how bad it is, and what to type; and a warning that holds one."""
+"""A finding about a recording: what is wrong, where, how bad it is, what to type; and a warning that becomes one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 from pydantic import Field
@@ -48,19 +48,5 @@ def error(kind: Kind, what: str, where: str, changes: Mapping[str, Any] | None =
     return Finding(kind=kind, what=what, where=where, severity="error", fix=fix, changes=changes or {})
 
 
-class FindingWarning(str):
-    """A warning of a data set that holds a finding: what ``check`` says of it."""
-
-    finding: Finding
-
-    @classmethod
-    def of_restart(cls, note: str) -> FindingWarning:
-        """An importer's note on counters that began again, which it has mended."""
-        warning = cls(note)
-        warning.finding = Finding(kind="counter_restart", what=note, where="all wheels", severity="note")
-        return warning
-
-
-def findings_of(warnings: Iterable[str]) -> list[Finding]:
-    """The findings that warnings hold."""
-    return [warning.finding for warning in warnings if isinstance(warning, FindingWarning)]
+class CounterRestart(str):
+    """A warning of a data set: counters began again, which its importer has mended. ``check`` tells it as a note."""

@@ -237,17 +237,10 @@ def unwrap(robot: Robot, logs: Sequence[WheelLog], headings: Sequence[Array]) ->
     unwrapped, ambiguous = list[Array](), list[int]()
     for index, (odometry, heading) in enumerate(zip(odometries, headings, strict=True)):
         driven = odometry[:, 2]
-        continuous = nearest_turns(heading, driven)
+        # Whole turns that bring each step closest to the odometry's; continuous headings stay as they are to the bit.
+        turns = np.round((np.diff(driven) - np.diff(heading)) / TURN)
+        continuous = heading + TURN * np.append(0.0, np.cumsum(turns))
         unwrapped.append(heading if continuous.tobytes() == heading.tobytes() else continuous)
         if np.abs(np.diff(continuous) - np.diff(driven)).max(initial=0.0) > TURN / 4:
             ambiguous.append(index)
     return unwrapped, ambiguous
-
-
-def nearest_turns(headings: Array, driven: Array) -> Array:
-    """Headings (S,), rad, with the whole turns that bring each step closest to that of an odometry's headings (S,).
-
-    Continuous headings stay as they are to the bit.
-    """
-    turns = np.round((np.diff(driven) - np.diff(headings)) / TURN)
-    return headings + TURN * np.append(0.0, np.cumsum(turns))

@@ -19,23 +19,15 @@ from numpy.typing import NDArray
 
 from omnibench.data import counters
 from omnibench.data.clock_matching import SEARCH, Streams, match_clocks, usual_period
-from omnibench.data.dataset import SPLITS, Dataset, Trajectory, make_dataset
-from omnibench.data.finding import FindingWarning
-from omnibench.data.recording import (
-    SECONDS,
-    TURNS,
-    Event,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    WheelReadings,
-    quantity_of,
-    scan_difference,
-)
+from omnibench.data.dataset import SPLITS, Dataset, Trajectory, every_second, make_dataset
+from omnibench.data.finding import CounterRestart
+from omnibench.data.recording import Event, Notes, PoseReadings, Recording, WheelReadings, scan_difference
+from omnibench.data.recording_options import SECONDS, TURNS, quantity_of
+from omnibench.data.recording_options import ReferenceOptions as Options
 from omnibench.data.references import KINDS, LATE, TURN, UNITS, References
 from omnibench.data.scans import Scans
 from omnibench.data.scratch import Scratch
-from omnibench.data.splits import complete, divided, every_second, remaining
+from omnibench.data.splits import complete, divided, remaining
 from omnibench.data.spoiled_references import reference_jumps
 from omnibench.errors import DataError
 from omnibench.progress import tell_reading
@@ -109,8 +101,6 @@ class AlignedRecording:
 
     def later(self, offset: float, drift: float) -> AlignedRecording:
         """With a reference that is later by offset (s) and by drift (s per s since its first finite time)."""
-        if not offset and not drift:
-            return self
         measured, stamps = self.measured, self.poses.times[:1]
         if measured is not None and not len(stamps):
             stamps = np.append(measured.t0, measured.t1)
@@ -124,7 +114,7 @@ class AlignedRecording:
         return replace(self, poses=replace(self.poses, times=moved(self.poses.times)), measured=measured)
 
 
-def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str]) -> list[float | None]:
+def _ranges(recordings: Sequence[Recording], options: Options, notes: Notes) -> list[float | None]:
     """The range of each wheel's counter, by all recordings, or the one that the options say; None if it has none."""
     count, unit = len(options.robot.wheel_names), ""
     by_wheel: list[list[Array]] = [[] for _ in range(count)]  # counts of every recording, without lone readings
@@ -151,7 +141,7 @@ def _ranges(recordings: Sequence[Recording], options: ReferenceOptions, notes: l
 
 
 def _readings(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
+    recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (F, N), rad, that count on, or rates, rad/s, in the robot's sense; and the readings that are used (F,).
 
@@ -175,7 +165,7 @@ def _readings(
         used[rows[jumping.any(axis=1)]] = False
         if count := int(jumping.sum()):
             jump = f"{plural(count, 'single reading')} of wheel positions that jump and return left out"
-            notes.append(FindingWarning.of_restart(f"{place}: {jump}"))
+            notes.append(CounterRestart(f"{place}: {jump}"))
     if not recording.a_run and (held := counters.held_readings(values[used])).any():
         used[np.flatnonzero(used)[held]] = False
         holding = f"rows in which the wheels hold their last value left out: {1 - held.mean():.0%} are read"
@@ -183,9 +173,7 @@ def _readings(
     return values * options.wheel_factors(readings.unit), used
 
 
-def _counted_on(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
-) -> Array:
+def _counted_on(recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes) -> Array:
     """Positions (F, N) that count on where their counters begin again, with the turns that a register lost."""
     readings, lost, longest = recording.wheels, 0, 0.0
     seconds, columns = readings.times * SECONDS[options.wheel_time_unit], []
@@ -210,12 +198,12 @@ def _counted_on(
     if lost:
         back = f"{plural(lost, 'step')} of wheel positions ran back by a register of {longest:.10g} ticks, read late"
         mended = f"{back}; they got a turn of it back (wraps_at=2^32 or never keeps them)"
-        notes.append(FindingWarning.of_restart(f"{recording.place}: {mended}"))
+        notes.append(CounterRestart(f"{recording.place}: {mended}"))
     return np.column_stack(columns)
 
 
 def _wheel_samples(
-    recording: Recording, values: Array, used: NDArray[np.bool_], options: ReferenceOptions, notes: list[str]
+    recording: Recording, values: Array, used: NDArray[np.bool_], options: Options, notes: Notes
 ) -> WheelSamples:
     """The wheel samples of a recording, in stretches without gaps and restarts. values, used: see ``_readings``.
 
@@ -254,7 +242,7 @@ def _wheel_samples(
     if count := int(restart.sum()):
         anew = f"the positions begin anew {plural(count, 'time')}, faster than any wheel turns"
         way = "if that is a counter that wraps, --set wraps_at=N"
-        notes.append(FindingWarning.of_restart(f"{place}: {anew} ({way}); runs end there"))
+        notes.append(CounterRestart(f"{place}: {anew} ({way}); runs end there"))
     steering: Array | None = None
     if readings.steering is not None:
         steering = _steering_angles(readings.steering, recording, options)
@@ -267,7 +255,7 @@ def _wheel_samples(
     return WheelSamples(begins[whole], ends[whole], rates[whole], angles, steering, stretch, rows[whole])
 
 
-def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptions) -> Array:
+def _steering_angles(shown: Array, recording: Recording, options: Options) -> Array:
     """Steering angles (F, S), rad, of the readings. DataError: they are whole numbers beyond a turn, as ticks are."""
     stated = any(name.startswith("steering_") for name in options.model_fields_set - {"steering_columns"})
     as_they_are = recording.a_run and not stated
@@ -285,7 +273,7 @@ def _steering_angles(shown: Array, recording: Recording, options: ReferenceOptio
     return angles + np.radians(options.steering_offsets_deg or 0.0)
 
 
-def _misread(recording: Recording, rates: Array, durations: Array, options: ReferenceOptions) -> DataError:
+def _misread(recording: Recording, rates: Array, durations: Array, options: Options) -> DataError:
     """The error of mean rates (F, N), rad/s, over durations (F,), s, that are too fast to be in the unit."""
     unit = recording.wheels.unit
     counts = rates * durations[:, None] / options.wheel_factors(unit)
@@ -298,9 +286,7 @@ def _misread(recording: Recording, rates: Array, durations: Array, options: Refe
     return DataError(f"{what}; --set {first}, gear_ratio=N (turns of the motor for one of the wheel), {others}")
 
 
-def _aligned(
-    recording: Recording, ranges: Sequence[float | None], options: ReferenceOptions, notes: list[str]
-) -> AlignedRecording:
+def _aligned(recording: Recording, ranges: Sequence[float | None], options: Options, notes: Notes) -> AlignedRecording:
     """The recording in SI units and the robot's senses, its reference by its clock with the options' offset."""
     tell_reading(1, "run")
     samples = _wheel_samples(recording, *_readings(recording, ranges, options, notes), options, notes)
@@ -324,7 +310,7 @@ def _aligned(
     return aligned.later(options.pose_time_offset, options.pose_time_drift)
 
 
-def measured_as(measured: References, options: ReferenceOptions, second: float = 1.0) -> References:
+def measured_as(measured: References, options: Options, second: float = 1.0) -> References:
     """References in SI units and in the robot's senses. second: unit of their times, s.
 
     The signs of the poses hold for x and y of positions and displacements, and for turns and headings; distances have
@@ -340,9 +326,7 @@ def measured_as(measured: References, options: ReferenceOptions, second: float =
     return replace(measured, t0=t0, t1=t1, values=values, sigmas=sigmas, rate_sigma=measured.rate_sigma * abs(heading))
 
 
-def _by_matched_clocks(
-    aligned: Sequence[AlignedRecording], options: ReferenceOptions, notes: list[str]
-) -> list[AlignedRecording]:
+def _by_matched_clocks(aligned: Sequence[AlignedRecording], options: Options, notes: Notes) -> list[AlignedRecording]:
     """The recordings with poses by the wheels' clock, as matched, which ``notes`` tells."""
     matched, begun, streams, search = list(aligned), dict[int, AlignedRecording](), [], SEARCH
     for index, each in enumerate(aligned):
@@ -401,9 +385,7 @@ class MadeRun:
     scans: NDArray[np.intp]
 
 
-def dataset_of(
-    recordings: Sequence[Recording], options: ReferenceOptions, notes: list[str], *, simulated: bool = False
-) -> Dataset:
+def dataset_of(recordings: Sequence[Recording], options: Options, notes: Notes, *, simulated: bool = False) -> Dataset:
     """The data set of the runs of recordings. DataError in one line: no run is left, or a unit cannot be right.
 
     notes: what was left out, mended or decided is added; the data set's warnings hold it.
@@ -448,9 +430,7 @@ def _in_file(run: MadeRun, scratch: Scratch) -> MadeRun:
     return replace(run, trajectory=trajectory, recording=replace(recording, wheels=none, poses=None, measured=None))
 
 
-def cut_into_runs(
-    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str], *, alone: bool = True
-) -> list[MadeRun]:
+def cut_into_runs(aligned: AlignedRecording, options: Options, notes: Notes, *, alone: bool = True) -> list[MadeRun]:
     """The runs of a recording, cut as the options say; what is left out is added to ``notes``.
 
     alone: the recording is the only one. DataError: its wheels and poses share no time.
@@ -502,7 +482,7 @@ def cut_into_runs(
     return referenced
 
 
-def _pieces(aligned: AlignedRecording, part: slice, options: ReferenceOptions) -> list[Piece]:
+def _pieces(aligned: AlignedRecording, part: slice, options: Options) -> list[Piece]:
     """The pieces of an unbroken stretch: between rests, events or windows, or all of it."""
     times, angles = aligned.samples.edges(part)
     span, stamps = (float(times[0]), float(times[-1])), aligned.poses.times
@@ -588,9 +568,7 @@ def from_events(
     return pieces
 
 
-def _without_lone_jumps(
-    aligned: AlignedRecording, options: ReferenceOptions, notes: list[str]
-) -> tuple[AlignedRecording, Array]:
+def _without_lone_jumps(aligned: AlignedRecording, options: Options, notes: Notes) -> tuple[AlignedRecording, Array]:
     """The recording without lone poses that jump, and the times (B, 2), s, of the poses before and after each break."""
     samples, poses = aligned.samples, aligned.poses
     lone, broken = np.zeros((2, len(poses.times)), dtype=bool)  # broken: after each pose
@@ -599,9 +577,9 @@ def _without_lone_jumps(
             inside = (poses.times >= samples.begins[part][0]) & (poses.times <= samples.ends[part][-1])
             if (seen := np.flatnonzero(inside)).size:
                 log = samples.log(options.robot, part, poses.times[seen])
-                jumps = reference_jumps(options.robot, log, poses.poses[seen])
-                lone[seen[jumps.lone]] = True
-                broken[seen[jumps.shifts]] = options.jumps == "cut"
+                alone, shifts = reference_jumps(options.robot, log, poses.poses[seen])
+                lone[seen[alone]] = True
+                broken[seen[shifts]] = options.jumps == "cut"
         if lone.any():
             jump = f"{plural(int(lone.sum()), 'pose')} that jump and return left out (jumps={options.jumps})"
             notes.append(f"{aligned.recording.place}: {jump}")
@@ -611,7 +589,7 @@ def _without_lone_jumps(
     return replace(aligned, poses=poses), between[broken[:-1] | gap]
 
 
-def _unbroken(piece: Piece, aligned: AlignedRecording, breaks: Array, options: ReferenceOptions) -> Iterator[Piece]:
+def _unbroken(piece: Piece, aligned: AlignedRecording, breaks: Array, options: Options) -> Iterator[Piece]:
     """The parts of a piece without gaps and jumps, from rest on if wanted."""
     assert piece.span is not None  # it is not cut yet
     begin, end = piece.span
@@ -706,17 +684,15 @@ def _made(aligned: AlignedRecording, rows: NDArray[np.intp], zero: float, poses:
     return MadeRun(run, zero, recording, scans)
 
 
-def _called(
-    run: MadeRun, samples: WheelSamples, piece: Piece, number: int | None, count: int, *, alone: bool
-) -> MadeRun:
-    """A run with its name, session, start and command. number: of the piece, if there are several; count: of runs."""
+def _called(run: MadeRun, samples: WheelSamples, piece: Piece, number: int | None, nth: int, *, alone: bool) -> MadeRun:
+    """A run with its name, session, start and command. number: of the piece, if several; nth: of the run."""
     recording, trajectory, first = run.recording, run.trajectory, float(samples.begins[0])
     changes: dict[str, Any] = {}
     if recording.numbered:
         stretch = 0
         if samples.angles is not None:  # which begin anew in each stretch
             stretch, first = int(samples.stretch[piece.part.start]), float(samples.begins[piece.part.start])
-        name = f"{count:03d}" + (f"-{piece.command}" if piece.command else "")
+        name = f"{nth:03d}" + (f"-{piece.command}" if piece.command else "")
         changes = {"id": name if alone else f"{recording.name}/{name}", "command": piece.command}
         changes |= {"session": f"{recording.name}#{stretch + 1}" if stretch else recording.name, "started_at": 0.0}
     elif number is None:
@@ -731,9 +707,7 @@ def _called(
     return replace(run, trajectory=replace(trajectory, **changes))
 
 
-def _with_references(
-    runs: Sequence[MadeRun], aligned: AlignedRecording, notes: list[str], *, whole: bool
-) -> list[MadeRun]:
+def _with_references(runs: Sequence[MadeRun], aligned: AlignedRecording, notes: Notes, *, whole: bool) -> list[MadeRun]:
     """The runs of a recording with those of its references that lie within them; the others are added to ``notes``.
 
     whole: the recording is one run, of whose start and end a reference without times tells. Runs without poses and
@@ -793,7 +767,7 @@ def _apart(aligned: AlignedRecording, offset: float) -> DataError:
     return DataError(f"{place}: no two poses while the wheels were recorded ({spans}); {way}")
 
 
-def with_commands(runs: Sequence[Trajectory], options: ReferenceOptions, notes: list[str]) -> list[Trajectory]:
+def with_commands(runs: Sequence[Trajectory], options: Options, notes: Notes) -> list[Trajectory]:
     """The runs with the commands that their names say, by ``command_pattern`` or by the words before their numbers."""
     if options.command_pattern:
         matches = [re.search(options.command_pattern, run.id.partition("#")[0]) for run in runs]
@@ -831,9 +805,7 @@ def _command_in(name: str) -> str:
     return "_".join(next((words for words in reversed(parts) if words), []))
 
 
-def divided_runs(
-    runs: Sequence[Trajectory], made: Sequence[MadeRun], options: ReferenceOptions, notes: list[str]
-) -> list[Trajectory]:
+def divided_runs(runs: Sequence[Trajectory], made: list[MadeRun], options: Options, notes: Notes) -> list[Trajectory]:
     """The runs with their splits and the numbers of their repetitions, without those that are left out.
 
     Without patterns and without splits in the source every second run of a command validates, and of runs without a

@@ -9,9 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from omnibench.data.dataset import Dataset, Split, Trajectory, with_warnings
-from omnibench.data.dataset import every_second as every_second
-from omnibench.data.dataset import repetitions as repetitions
+from omnibench.data.dataset import Dataset, Split, Trajectory, every_second, repetitions, with_warnings
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.words import some
 

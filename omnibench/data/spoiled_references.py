@@ -20,7 +20,6 @@ four robots under motion capture (OptiOdom), and about 1 mrad of the noise alone
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise, product
 
 import numpy as np
@@ -41,22 +40,14 @@ _DEVIATIONS, _QUANTILE, _PER_QUANTILE, _FEWEST = 6.0, 0.4, 1.91, 20
 _MOST_AWAY = 8  # poses that a reference may be elsewhere before it counts as shifted; chosen
 
 
-@dataclass(frozen=True, eq=False)
-class Jumps:
-    """Jumps of a reference. lone: poses that are elsewhere. shifts: of poses after which it goes on apart."""
+def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The jumps of reference poses (K, 3), m, m, rad, at the stamps of a log of the wheels.
 
-    lone: NDArray[np.intp]
-    shifts: NDArray[np.intp]
-
-    def __len__(self) -> int:
-        return len(self.lone) + len(self.shifts)
-
-
-def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> Jumps:
-    """The jumps of reference poses (K, 3), m, m, rad, at the stamps of a log of the wheels."""
+    Lone poses that are elsewhere, and those after which it goes on apart (shifts), by their indices.
+    """
     none = np.empty(0, dtype=np.intp)
     if len(poses) <= _FEWEST:
-        return Jumps(none, none)
+        return none, none
     (odometry,) = OdometryModel.of_design(robot, "arc").poses([log])
     # The odometry of coarse counters is late by up to a tick of every wheel.
     angles = np.abs(log.signals) * np.diff(log.times, prepend=0.0)[:, None]
@@ -74,7 +65,7 @@ def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> Jumps:
         return np.asarray(within.all(axis=1))
 
     if agree(steps, steps + 1).all():
-        return Jumps(none, none)
+        return none, none
 
     # The longest track of poses that agree, each with the one before; it goes on elsewhere at the price of some poses.
     near = [agree(np.arange(len(poses) - lag), np.arange(lag, len(poses))).tolist() for lag in range(1, _MOST_AWAY + 2)]
@@ -92,7 +83,7 @@ def reference_jumps(robot: Robot, log: WheelLog, poses: Array) -> Jumps:
         track.append(before[track[-1]])
     track.reverse()
     apart = [first for first, last in pairwise(track) if last - first > len(near) or not near[last - first - 1][first]]
-    return Jumps(np.setdiff1d(np.arange(len(poses)), track), np.array(apart, dtype=np.intp))
+    return np.setdiff1d(np.arange(len(poses)), track), np.array(apart, dtype=np.intp)
 
 
 def _misfits(odometry: Array, poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
@@ -227,11 +227,8 @@ def check_dataset_folder(folder: Path) -> None:
     check_place(folder)
 
 
-class _Frames(NamedTuple):
-    """A table in parts, with the types of its columns by name."""
-
-    types: Mapping[str, Any]
-    parts: Iterable[pl.DataFrame]
+_Frames = tuple[Mapping[str, Any], Iterable[pl.DataFrame]]
+"""Types of a table's columns by name, and the table in parts."""
 
 
 def _rows_of_runs(runs: Sequence[Trajectory], times: str, groups: Mapping[str, list[str]]) -> _Frames:
@@ -252,7 +249,7 @@ def _rows_of_runs(runs: Sequence[Trajectory], times: str, groups: Mapping[str, l
                 columns |= {column: None if values is None else values[:, i] for i, column in enumerate(group)}
             yield pl.DataFrame(columns, schema=types)
 
-    return _Frames(types, parts())
+    return types, parts()
 
 
 def _tables(dataset: Dataset, *, whole: bool) -> dict[str, _Frames]:
@@ -277,12 +274,12 @@ def _tables(dataset: Dataset, *, whole: bool) -> dict[str, _Frames]:
     if placed := [run for run in runs if run.start_known]:
         covered = present(run.pose_covariances is not None for run in placed)
         tables["poses"] = _rows_of_runs(placed, "pose_times", stored.POSES | (stored.COVARIANCES if covered else {}))
-    return {name: _Frames(frame.schema, [frame]) for name, frame in frames.items()} | tables
+    return {name: (frame.schema, [frame]) for name, frame in frames.items()} | tables
 
 
 def tables_of(dataset: Dataset) -> dict[str, pl.DataFrame]:
     """The tables of a data set by name: trajectories, wheels, and poses, references and commands, if there are some."""
-    return {name: pl.concat(table.parts) for name, table in _tables(dataset, whole=False).items()}
+    return {name: pl.concat(parts) for name, (_, parts) in _tables(dataset, whole=False).items()}
 
 
 def _without_empty(frame: pl.DataFrame) -> pl.DataFrame:

@@ -19,7 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from omnibench.config import LONGEST_NAME
-from omnibench.data.delimited import missing_column, not_increasing
+from omnibench.data.delimited import Lines, missing_column, not_increasing
 from omnibench.data.parquet import OpenedTable, parquet_shape, readable, scan_table
 from omnibench.errors import DataError, nearest
 from omnibench.files import MOST_TEXT, check_file, unquoted_formulas
@@ -97,9 +97,7 @@ def values_flaw(values: Array, holds: str = "it holds", way: str = "check the un
     return row, f"{holds} {rows[row][np.abs(rows[row]).argmax()]:g}, which no robot can reach; {way}"
 
 
-def refuse(
-    file: Path, rows: Sequence[int] | Rows, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()
-) -> None:
+def refuse(file: Path, rows: Lines, faulty: Any, what: str, values: Sequence[Any] | pl.Series = ()) -> None:
     """DataError for the first of some rows of a file, from 0, that is ``faulty`` (n,).
 
     what: with ``{}`` for the row's one of the values (n,).
@@ -227,13 +225,11 @@ def arrays_of_runs(
 ) -> list[dict[str, Array]]:
     """The arrays of each run in a table, if there is one. without: ids of runs that may have no rows in it."""
     arrays = {index: of_run for index, _, of_run in arrays_by_run([table] if table else [], runs, groups, flaw)}
-    refuse_runs_without_rows(table.file if table else None, runs, arrays, without)
+    require_rows(table.file if table else None, runs, arrays, without)
     return [arrays.get(index, {}) for index in range(len(runs.frame))]
 
 
-def refuse_runs_without_rows(
-    file: Path | None, runs: Table, present: Collection[int], without: Collection[str] = ()
-) -> None:
+def require_rows(file: Path | None, runs: Table, present: Collection[int], without: Collection[str] = ()) -> None:
     """DataError: a run, by its index not among those present, has no rows in a file, and is not in ``without``."""
     for index, run in enumerate(runs.ids):
         if index not in present and run not in without:
@@ -329,7 +325,7 @@ def _samples_in_file(file: Path, runs: Table, robot: Robot) -> list[Samples] | N
         if not np.array_equal(rows, np.arange(first + count, first + count + len(rows))):
             return None
         places[index] = first, count + len(rows), float(arrays["times"][-1])
-    refuse_runs_without_rows(file, runs, places)
+    require_rows(file, runs, places)
     columns = {"times": ["t"], **columns}
     of_odometry = [column for name in _OF_ODOMETRY for column in columns.get(name, ())]
     samples = []

@@ -18,7 +18,7 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.recording import RobotOption
+from omnibench.data.recording_options import RobotOption
 from omnibench.data.splits import training_split
 from omnibench.data.storage import load_dataset
 from omnibench.design.d_optimality import Counts

@@ -16,7 +16,7 @@ from lanes import slow, slow_cases
 from omnibench.check.misreadings import Explained, Recorded, search
 from omnibench.check.source import recorded as read_as_recorded
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.recording import corrected_robot
+from omnibench.data.recording_options import corrected_robot
 from omnibench.data.references import Reference, References
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.source import simulate_dataset

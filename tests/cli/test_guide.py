@@ -25,7 +25,7 @@ from omnibench.cli.examples import EXAMPLES, SAMPLES, Example, find_example, wri
 from omnibench.cli.handbook_topics import HANDBOOK, topics
 from omnibench.compare.config import CompareConfig, read_compare_config
 from omnibench.config import read_model
-from omnibench.data.recording import RobotOption
+from omnibench.data.recording_options import RobotOption
 from omnibench.report.calibration_report import CalibrationResult
 from omnibench.report.terminal import print_result
 

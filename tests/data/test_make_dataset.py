@@ -19,7 +19,7 @@ from wheeled_samples import driven
 import omnibench
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.data.recording import ReferenceOptions
+from omnibench.data.recording_options import ReferenceOptions
 from omnibench.data.runs import division_in_words
 from omnibench.data.splits import divided
 from omnibench.data.storage import load_dataset, save_dataset

@@ -55,7 +55,8 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
         label, role = THEORETICAL_NAME if entry is None else entry.label, row_role(entry)
         colour = views.THEORETICAL_STYLE if entry is design else view.styles[label]
         reached = fixed(None if cost is None else cost.value, decimals), views.interval_cell(cost, decimals)
-        fell, said = views.improvement_cells(improvement, 1 if brief else 2), "" if entry is None else verdict(view, entry)
+        fell = views.improvement_cells(improvement, 1 if brief else 2)
+        said = "" if entry is None else verdict(view, entry)
         finals = ((position, worst), (heading, most))
         ends = [Cell(mean, "" if mean == NOTHING else f"worst {largest}") for mean, largest in finals]
         judged: list[Cell | str] = [Cell(*difference), said] if split == view.scored else []

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from omnibench.config import read_yaml, validate
 from omnibench.data.importers.tum import planar_headings
-from omnibench.data.recording import ScanReadings, ScanShape, scan_difference
+from omnibench.data.recording import Notes, ScanReadings, ScanShape, scan_difference
 from omnibench.data.scans import Mount, Ranges, Scanner
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError, nearest
 from omnibench.files import check_file, read_text
@@ -86,7 +86,7 @@ class Bag:
     clock_logged: Stamps
 
     def __init__(
-        self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: list[str]
+        self, path: Path, reader: AnyReader, recorded: Sequence[str], definitions: Sequence[Path], notes: Notes
     ) -> None:
         self.path, self.definitions, self.notes, self._reader = path, definitions, notes, reader
         self._connections: dict[tuple[str, str], list[Any]] = defaultdict(list)
@@ -113,16 +113,14 @@ class Bag:
             raise DataError(f"{self.path}: {key}: topic {chosen.name} has no messages; record it, or name another one")
         return chosen
 
-    def records(
-        self, topic: Topic, first: int | None = None, last: int | None = None
-    ) -> Iterator[tuple[int, int, Any]]:
+    def records(self, topic: Topic, between: tuple[int, int] | None = None) -> Iterator[tuple[int, int, Any]]:
         """The messages of a topic in the order in which they were recorded. DataError: the bag is damaged.
 
         Each is given with its number in its topic, from 1, and the time of recording, ns, and is None if it cannot be
-        decoded. first, last: times of recording, ns, between which messages are read; numbers count from the first of
-        these.
+        decoded. between: times of recording, ns, of the first and the last message that are read; numbers count from
+        the first of these.
         """
-        number, stop = 0, None if last is None else last + 1
+        number, (first, stop) = 0, (between[0], between[1] + 1) if between else (None, None)
         with _damage_as_error(self.path):
             messages = self._reader.messages(self._connections[topic.name, topic.type], first, stop)
             for number, (_, logged, data) in enumerate(messages, 1):
@@ -227,9 +225,7 @@ def way_up(frame: str, parents: Mapping[str, str], ends: Callable[[str], bool]) 
 
 
 @contextmanager
-def open_bag(
-    path: Path, notes: list[str], recorded: Sequence[str] = (), definitions: Sequence[Path] = ()
-) -> Iterator[Bag]:
+def open_bag(path: Path, notes: Notes, recorded: Sequence[str] = (), definitions: Sequence[Path] = ()) -> Iterator[Bag]:
     """Open a bag for reading. DataError in one line: it is no bag, it is cut off, or it is damaged.
 
     notes, recorded: as for ``Bag``. definitions: files or folders of .msg files, of types that the bag does not define.
@@ -430,8 +426,8 @@ def read_scans(bag: Bag, topic: Topic, mount: Mount | None) -> ScanReadings:
         places = {key: index for index, key in enumerate(keys)}
         ranges = np.empty((len(chosen), scanner.rays), np.float32)
         with open_bag(bag.path, [], [topic.name] if topic.recorded else [], bag.definitions) as again:
-            first, last = int(logged[chosen].min()), int(logged[chosen].max())
-            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), first, last):
+            between = int(logged[chosen].min()), int(logged[chosen].max())
+            for _, when, message in again.records(again.topic(topic.name, "scan_topic"), between):
                 index = places.pop((when, topic.stamp(message, when)), None)
                 if index is not None and len(message.ranges) == scanner.rays:
                     ranges[index] = _measured(message)

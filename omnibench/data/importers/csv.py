@@ -26,7 +26,8 @@ from omnibench.data.dataset import SPLITS, Dataset
 from omnibench.data.delimited import ColumnError, Table, missing_column
 from omnibench.data.importer import Importer
 from omnibench.data.importers.tum import planar_headings, read_tum
-from omnibench.data.recording import PoseReadings, Recording, ReferenceOptions, RunAttributes, WheelReadings, words_of
+from omnibench.data.recording import Notes, PoseReadings, Recording, RunAttributes, WheelReadings
+from omnibench.data.recording_options import ReferenceOptions, words_of
 from omnibench.data.references import KINDS, NUMBERS, References, reference_flaw, references_of
 from omnibench.data.runs import dataset_of
 from omnibench.data.scratch import Scratch
@@ -223,9 +224,7 @@ _FIRST_ROWS = 1000  # by whose times it is told whether they count from 1970
 _EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # of unix time, which is 1.8e9 s
 
 
-def unit_options(
-    columns: Mapping[str, str], table: Table, options: CsvOptions, *, shared: bool
-) -> dict[str, list[str]]:
+def units_in(columns: Mapping[str, str], table: Table, options: CsvOptions, *, shared: bool) -> dict[str, list[str]]:
     """Units that columns say and that differ from those read: what to set (``position_unit=mm``), and the columns.
 
     columns: their names by the keys of the option ``columns``. They say a unit in their names, in the row below, or as
@@ -268,9 +267,8 @@ _TURNS = frozenset(("orientation", "rotation", "quaternion", "quat", "q", "rot")
 def missing_error(table: Table, missing: Sequence[str], options: CsvOptions) -> ColumnError:
     """The error that names what is missing, by its keys, what was found, and what to type if that is meant."""
     if not table.headed:
-        way = (
-            f'say by numbers, from 1, which of them are {", ".join(missing)}: --set "columns={{{missing[0]}: 1, ...}}"'
-        )
+        typed = f'--set "columns={{{missing[0]}: 1, ...}}"'
+        way = f"say by numbers, from 1, which of them are {', '.join(missing)}: {typed}"
         return ColumnError(f"{table.file}: it has no header and {len(table.names)} columns; {way}")
     names = [f"'{options.accepted[key][0]}'" for key in missing]
     what = f"column {names[0]} is" if len(names) == 1 else f"columns {', '.join(names[:-1])} and {names[-1]} are"
@@ -315,7 +313,7 @@ def _way_out(table: Table, missing: Sequence[str], options: CsvOptions) -> str:
     shared = any(key in missing or key in found for key in wheels[1:])
     time = wheels[0] if shared else poses[0]
     named = likely | {key: found[key] for key in (time,) if key in found}
-    settings = list(unit_options(named, table, options, shared=shared))
+    settings = list(units_in(named, table, options, shared=shared))
     if any(delimited.DECIMAL_COMMA.fullmatch(cell) for name in likely.values() for cell in table.texts(name)[:100]):
         settings.append("decimal=comma")
     if not joints.isdisjoint(likely.values()):
@@ -367,7 +365,7 @@ class TableFiles:
     references: Path | None = None
 
 
-def find_tables(source: Path, options: CsvOptions, notes: list[str]) -> list[TableFiles]:
+def find_tables(source: Path, options: CsvOptions, notes: Notes) -> list[TableFiles]:
     """The tables under a folder, or those of a file, by the names of files, else by what their headers hold."""
     alone = source.is_file()
     folder = source.parent if alone else source
@@ -438,11 +436,7 @@ def _by_ending(source: Path, files: Sequence[Path], endings: Sequence[str]) -> d
 
 
 def _by_headers(
-    source: Path,
-    tables: Sequence[Path],
-    references: Callable[[str], Path | None],
-    options: CsvOptions,
-    notes: list[str],
+    source: Path, tables: Sequence[Path], references: Callable[[str], Path | None], options: CsvOptions, notes: Notes
 ) -> list[TableFiles]:
     """The tables under a folder whose headers hold columns of wheels and of poses, or of wheels with references.
 
@@ -473,9 +467,8 @@ def _by_headers(
         apart = [streams_in(table, options, shared=False) for table, _ in lacking]
         of_wheels, of_poses = ([each.table.file for each in of if not each.missing] for of in zip(*apart, strict=True))
         if of_wheels and of_poses:
-            way = (
-                "call them <run>_wheels.csv and <run>_poses.csv, or --set wheel_suffix=ENDING --set pose_suffix=ENDING"
-            )
+            endings = "--set wheel_suffix=ENDING --set pose_suffix=ENDING"
+            way = f"call them <run>_wheels.csv and <run>_poses.csv, or {endings}"
             raise DataError(f"{of_wheels[0]} holds wheels and {of_poses[0].name} poses; {way}")
         raise missing_error(*min(lacking, key=lambda pair: len(pair[1])), options)
     if lacking:
@@ -520,7 +513,7 @@ def read_measured(table: Table) -> References:
     return references
 
 
-def _values(stream: Stream, table: Table, notes: list[str]) -> tuple[Array, Array, tuple[str, ...], NDArray[np.intp]]:
+def _values(stream: Stream, table: Table, notes: Notes) -> tuple[Array, Array, tuple[str, ...], NDArray[np.intp]]:
     """Times (F,) and values (F, n) of a stream in the table of a run, their names, and the rows (F,) that hold them.
 
     Rows without any value of the stream are left out, and so are rows that repeat a time. DataError names the row of
@@ -567,7 +560,7 @@ def _of_runs(table: Table, time: str) -> str:
 
 
 def _recordings(
-    files: TableFiles, measured: Tables, attributes: Attributes, options: CsvOptions, notes: list[str], *, several: bool
+    files: TableFiles, measured: Tables, attributes: Attributes, options: CsvOptions, notes: Notes, *, several: bool
 ) -> Iterator[Recording]:
     """The recording of every run that a column of the tables names, or of all of their rows.
 
@@ -586,7 +579,7 @@ def _recordings(
         raise ColumnError("; and ".join(errors))
     for stream in streams:
         names = {key: stream.names[key] for key in stream.keys}
-        if said := unit_options(names, stream.table, options, shared=shared):
+        if said := units_in(names, stream.table, options, shared=shared):
             columns = ", ".join(dict.fromkeys(name for columns in said.values() for name in columns))
             typed = " ".join(f"--set {setting}" for setting in said)
             option = next(iter(said)).partition("=")[0]
@@ -608,8 +601,7 @@ def _recordings(
         references, seen = None if rows is None else read_measured(rows), None
         readings = _wheels(streams[0], wheels.get(run) or wheels[None], options, notes)
         if files.poses is not None and files.poses.suffix == ".tum":
-            track = read_tum(files.poses)
-            seen = PoseReadings(track.times, track.poses, radians=True)
+            seen = read_tum(files.poses)
         elif placed is not None:
             seen = _poses(streams[1], placed, options, notes)
         elif references is None:
@@ -622,18 +614,16 @@ def _recordings(
         yield Recording(name, place, readings, seen, references, attributes=said_of_run, one_table=shared)
 
 
-def _wheels(stream: Stream, table: Table, options: CsvOptions, notes: list[str]) -> WheelReadings:
+def _wheels(stream: Stream, table: Table, options: CsvOptions, notes: Notes) -> WheelReadings:
     """The wheels in the rows of a run."""
     count = len(options.robot.wheel_names)
     times, values, names, _ = _values(stream, table, notes)
     steering = values[:, count:] if len(names) > count else None
-    place = "" if stream.shared else str(table.file)
-    return WheelReadings(
-        times, values[:, :count], options.wheel_unit, steering, names[:count], names[count:], place=place
-    )
+    place, columns = "" if stream.shared else str(table.file), (names[:count], names[count:])
+    return WheelReadings(times, values[:, :count], options.wheel_unit, steering, *columns, place=place)
 
 
-def _poses(stream: Stream, table: Table, options: CsvOptions, notes: list[str]) -> PoseReadings:
+def _poses(stream: Stream, table: Table, options: CsvOptions, notes: Notes) -> PoseReadings:
     """The poses in the rows of a run as they were recorded; those of a quaternion have headings in rad."""
     times, values, _, rows = _values(stream, table, notes)
     side = np.array([1.0, -1.0 if options.up == "y" else 1.0])
@@ -647,7 +637,7 @@ def _poses(stream: Stream, table: Table, options: CsvOptions, notes: list[str]) 
     return PoseReadings(times, np.column_stack([places, orientations.headings]), radians=True)
 
 
-def read_run_attributes(source: Path, options: CsvOptions, notes: list[str]) -> Attributes:
+def read_run_attributes(source: Path, options: CsvOptions, notes: Notes) -> Attributes:
     """Attributes of each run in a table of runs, by its name; empty without one. DataError names the row of a flaw."""
     folder = source if source.is_dir() else source.parent
     file = options.runs_table or file_called(folder, RUN_TABLES, other_than=source)
@@ -723,10 +713,10 @@ class Csv(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All runs under ``source``; DataError names the file and the row of what is wrong."""
-        notes: list[str] = []
+        notes = list[str]()
         return dataset_of(self.recordings(source, notes), self.options, notes)
 
-    def recordings(self, source: Path, notes: list[str]) -> Sequence[Recording]:
+    def recordings(self, source: Path, notes: Notes) -> Sequence[Recording]:
         """The recordings of all tables, of each run by itself; of large tables in a temporary file, whence one is read.
 
         DataError names the file and the row of what is wrong.

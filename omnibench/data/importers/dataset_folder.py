@@ -11,24 +11,16 @@ from typing import Any, ClassVar
 from pydantic import Field, model_validator
 
 from omnibench.config import validate
-from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
-from omnibench.data.recording import (
-    SECONDS,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RunAttributes,
-    ScanReadings,
-    WheelReadings,
-)
+from omnibench.data.recording import Notes, PoseReadings, Recording, RunAttributes, ScanReadings, WheelReadings
+from omnibench.data.recording_options import SECONDS, ReferenceOptions
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Ranges, Scans
 from omnibench.data.splits import Names, joined
 from omnibench.data.storage import load_dataset, read_recorded
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.registry import importers
-from omnibench.robot.kinematics import Robot
 
 _POSE = ("x", "y", "theta")
 
@@ -82,10 +74,9 @@ class DatasetFolder(Importer):
         said = {key: getattr(options, key) or getattr(recorded, key) for key in ("description", "source", "licence")}
         return _reread(recorded, options.model_copy(update=said), [])
 
-    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:  # noqa: ARG002 (as of other importers)
+    def recordings(self, source: Path, notes: Notes) -> list[Recording]:  # noqa: ARG002 (as of other importers)
         """The runs of the data set as recordings, as they stand in its tables."""
-        recorded = read_recorded(source)
-        return recordings_of(recorded.trajectories, recorded.robot, recorded.scans, self.options)
+        return recordings_of(read_recorded(source), self.options)
 
 
 def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dataset:
@@ -95,7 +86,7 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     """
     known = {key: getattr(dataset, key) for key in ("robot", "name", "description", "source", "licence")}
 
-    def by(settings: Mapping[str, Any], notes: list[str]) -> Dataset:
+    def by(settings: Mapping[str, Any], notes: Notes) -> Dataset:
         return _reread(dataset, validate(DatasetOptions, {**known, **settings}, place), notes)
 
     before = by({}, []).warnings
@@ -104,19 +95,18 @@ def read_again(dataset: Dataset, settings: Mapping[str, Any], place: str) -> Dat
     return again if dataset.referenced else replace(again, referenced=False, warnings=tuple(notes))
 
 
-def _reread(recorded: Dataset, options: DatasetOptions, notes: list[str]) -> Dataset:
+def _reread(recorded: Dataset, options: DatasetOptions, notes: Notes) -> Dataset:
     """A data set by the options; its sample period stays unless these say another, or another unit of times."""
-    recordings = recordings_of(recorded.trajectories, recorded.robot, recorded.scans, options)
+    recordings = recordings_of(recorded, options)
     dataset = dataset_of(recordings, options, notes, simulated=recorded.simulated)
     if not options.sample_period and options.wheel_time_unit == "s":
         dataset = replace(dataset, sample_period=recorded.sample_period)
     return joined(dataset, [load_dataset(folder) for folder in options.join])
 
 
-def recordings_of(
-    runs: Sequence[Trajectory], robot: Robot, scans: Scans | None, options: DatasetOptions
-) -> list[Recording]:
-    """The runs of a robot's data set as recordings. ConfigError: it has no wheel of a name that the options give."""
+def recordings_of(dataset: Dataset, options: DatasetOptions) -> list[Recording]:
+    """The runs of a data set as recordings. ConfigError: it has no wheel of a name that the options give."""
+    robot, scans = dataset.robot, dataset.scans
     wheels = _chosen(options.wheel_columns or options.robot.wheel_names, robot.wheel_names, "omega_", "wheel_columns")
     axles = options.steering_columns or options.robot.drive.steered
     steering = _chosen(axles, robot.drive.steered, "steer_", "steering_columns")
@@ -125,7 +115,7 @@ def recordings_of(
     factors, second = options.wheel_factors(options.wheel_unit), SECONDS[options.wheel_time_unit]
     scanned = set() if scans is None else set(scans.trajectories)
     recordings = []
-    for run in runs:
+    for run in dataset.trajectories:
         others = {} if run.odometry is None else {"odometry": run.odometry}
         if run.angles is not None:
             others["angles"] = run.angles[:, turning] * factors
@@ -174,8 +164,7 @@ def importer_of(name: str, source: Path, options: Mapping[str, Any]) -> tuple[Im
     others = DatasetOptions.model_fields.keys() - entry.options.model_fields.keys()
     again = {key: value for key, value in options.items() if key in others}
     own = {key: value for key, value in options.items() if key not in again}
-    importer: Importer = importers.create(name, entry.cls.completed(own, source))
-    return importer, again
+    return importers.create(name, entry.cls.completed(own, source)), again
 
 
 def read_dataset(importer: Importer, source: Path, again: Mapping[str, Any]) -> Dataset:

@@ -78,23 +78,20 @@ def kinds() -> dict[str, Kind]:
 class Session:
     """Content of ``<session>_metadata.csv``, and the run files beside it by their numbers.
 
-    robot: its type. lengths, diameters: design values, m: L, or L1 and L2; of the wheels. angle_per_tick: of a wheel,
-    rad. starts: when each run's file begins in the session's log, s after the run's begin there.
+    group: name of the folder that holds session folders. robot: its type. lengths, diameters: design values, m: L, or
+    L1 and L2; of the wheels. angle_per_tick: of a wheel, rad. starts: when each run's file begins in the session's log,
+    s after the run's begin there.
     """
 
     file: Path
     name: str
+    group: str
     robot: str
     lengths: tuple[float, ...]
     diameters: tuple[float, ...]
     angle_per_tick: float
     starts: tuple[float, ...]
     runs: dict[int, Path]
-
-    @property
-    def group(self) -> str:
-        """The name of the folder that holds session folders."""
-        return self.file.parent.parent.name
 
     @property
     def dimensions(self) -> str:
@@ -130,7 +127,8 @@ def read_metadata(file: Path) -> Session:
     if not runs:
         raise DataError(f"{file.parent}: no {name}_run-NN.csv beside {file.name}")
     tick = 2 * math.pi / (numbers["ngear"][0] * numbers["encRes"][0])
-    return Session(file, name, robot, numbers["Li"], numbers["Di"], tick, numbers["odo_ti"], runs)
+    group = file.parent.parent.name
+    return Session(file, name, group, robot, numbers["Li"], numbers["Di"], tick, numbers["odo_ti"], runs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,15 +278,12 @@ class Optiodom(Importer):
         if not train and not options.validation and len(set(groups)) > 1:
             train = (min(groups),)
         kind, sentences = kinds()[robot], (f"{note[:1].upper()}{note[1:]}." for note in notes)
-        dataset = make_dataset(
-            options.name,
-            kind.robot(*common, options.robot_name or f"inesc_tec_{robot}"),
-            usual_period([run.pose_times for run in runs]),
-            divided(complete(runs), train, options.validation, "group", names=groups),
-            description=" ".join([kind.description.format(kind.title), *sentences]),
-            source=options.source,
-            licence="MIT",
-        )
+        description = " ".join([kind.description.format(kind.title), *sentences])
+        described: dict[str, Any] = {"description": description, "source": options.source, "licence": "MIT"}
+        design = kind.robot(*common, options.robot_name or f"inesc_tec_{robot}")
+        parted = divided(complete(runs), train, options.validation, "group", names=groups)
+        period = usual_period([run.pose_times for run in runs])
+        dataset = make_dataset(options.name, design, period, parted, **described)
         return replace(dataset, warnings=(*notes, *dataset.warnings))
 
 
@@ -318,9 +313,8 @@ def _read_run(session: Session, number: int, log: SessionLog | None, with_log: b
     rates, poses = ticks[1:] * session.angle_per_tick / steps[:, None], table.columns(_POSE[1:])
     steering = table.columns(("steering",))[1:] if "steering" in table else None
     name = f"{session.group}_{table.file.stem}"
-    run = Trajectory(
-        name, "train", times[1:], rates, times, poses, session=session.name, duration=end, steering=steering
-    )
+    known: dict[str, Any] = {"session": session.name, "duration": end, "steering": steering}
+    run = Trajectory(name, "train", times[1:], rates, times, poses, **known)
     if not with_log:
         return run
     robot = kind.robot(session.lengths, session.diameters, session.robot)

@@ -36,17 +36,8 @@ from omnibench.data.dataset import Dataset
 from omnibench.data.importer import Importer
 from omnibench.data.importers import bags
 from omnibench.data.importers.bags import Bag, Stamps, Topic, TopicMessages
-from omnibench.data.recording import (
-    Event,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RunAttributes,
-    Signs,
-    WheelReadings,
-    WheelUnit,
-    words_of,
-)
+from omnibench.data.recording import Event, Notes, PoseReadings, Recording, RunAttributes, WheelReadings
+from omnibench.data.recording_options import ReferenceOptions, Signs, WheelUnit, words_of
 from omnibench.data.references import Reference, ReferenceKind, References
 from omnibench.data.runs import WheelSamples, dataset_of, find_rests, measured_as
 from omnibench.data.scans import Mount
@@ -259,7 +250,7 @@ def _listed(topics: Sequence[Topic]) -> str:
     return ", ".join(map(str, topics)) or "none"
 
 
-def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) -> Recording:
+def read_bag(path: Path, name: str, options: RosbagOptions, notes: Notes) -> Recording:
     """The recording of a bag; what is left out is added to ``notes``. DataError, ConfigError."""
     with bags.open_bag(path, notes, options.recorded_stamps, [*map(Path, options.message_definitions)]) as bag:
         topics = wheel_topics(bag, options)
@@ -290,7 +281,10 @@ def read_bag(path: Path, name: str, options: RosbagOptions, notes: list[str]) ->
             raise DataError(f"{error}; scans=false leaves the scans out") from None
         place, sensed = f"{path}: topic {topics[0].name}", BagSensors(readings, options) if readings else None
         poses = read_poses(bag, references[0], options) if references else None
-        events = _events(bag, cutting) if cutting else ()
+        # Messages at which runs begin, with the text of a String as the command.
+        texts, begins = cutting and cutting.type == "std_msgs/msg/String", bag.timed(cutting) if cutting else ()
+        shown = [(time, str(message.data if texts and message else "")) for time, message in begins]
+        events = tuple(Event(time, one_line(text) or None) for time, text in shown)
         said = RunAttributes(sent=_sent_twists(bag, sent) if sent else None)
         return Recording(name, place, wheels, poses, None, events, said, seen, sensed, numbered=True)
 
@@ -647,13 +641,6 @@ def _by_transforms(bag: Bag, topic: Topic, frames: Sequence[str]) -> tuple[Stamp
     return stamps, whole
 
 
-def _events(bag: Bag, topic: Topic) -> tuple[Event, ...]:
-    """The messages of a topic as events, with the text of a String as the command."""
-    texts = topic.type == "std_msgs/msg/String"
-    shown = [(time, str(message.data if texts and message else "")) for time, message in bag.timed(topic)]
-    return tuple(Event(time, one_line(text) or None) for time, text in shown)
-
-
 def _sent_twists(bag: Bag, topic: Topic) -> Array | None:
     """The twists that were sent (C, 5), each valid until another one came; None without any."""
     read = bags.reader_of(("linear.x", "linear.y", "angular.z"))
@@ -719,7 +706,7 @@ class Rosbag(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All bags at or below ``source``; DataError names the bag, the topic and the message of what is wrong."""
-        notes: list[str] = []
+        notes = list[str]()
         recordings = self.recordings(source, notes)
         dataset = dataset_of(recordings, self.options, notes)
         doubtful = sorted({each.poses.doubtful for each in recordings if each.poses and each.poses.doubtful})
@@ -729,7 +716,7 @@ class Rosbag(Importer):
             raise DataError(f"{source}: {', '.join(doubtful)} is the robot's own odometry: {own}; {way}")
         return dataset
 
-    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+    def recordings(self, source: Path, notes: Notes) -> list[Recording]:
         """The bags at or below ``source`` as they were recorded."""
         recordings = [read_bag(path, name, self.options, notes) for name, path in bags.find_bags(source).items()]
         bare = [recording.place for recording in recordings if not recording.referenced]

@@ -11,25 +11,13 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from omnibench.data.dataset import SPLITS, Dataset, Split
+from omnibench.data.dataset import SPLITS, Dataset, Split, every_second, repetitions
 from omnibench.data.delimited import read_numbers
 from omnibench.data.importer import Importer
-from omnibench.data.recording import (
-    METRES,
-    RADIANS,
-    HeadingUnit,
-    PoseReadings,
-    Recording,
-    ReferenceOptions,
-    RobotOption,
-    RunAttributes,
-    ScanReadings,
-    WheelReadings,
-    WheelUnit,
-)
+from omnibench.data.recording import Notes, PoseReadings, Recording, RunAttributes, ScanReadings, WheelReadings
+from omnibench.data.recording_options import METRES, RADIANS, HeadingUnit, ReferenceOptions, RobotOption, WheelUnit
 from omnibench.data.runs import dataset_of
 from omnibench.data.scans import Scanner
-from omnibench.data.splits import every_second, repetitions
 from omnibench.errors import DataError
 from omnibench.registry import importers
 from omnibench.robot.kinematics import Array, Robot
@@ -99,10 +87,10 @@ class Table1(Importer):
 
     def read(self, source: Path) -> Dataset:
         """All trajectories under ``source``; DataError names the file and the row of what is wrong."""
-        notes: list[str] = []
+        notes = list[str]()
         return dataset_of(self.recordings(source, notes), self.options, notes)
 
-    def recordings(self, source: Path, notes: list[str]) -> list[Recording]:
+    def recordings(self, source: Path, notes: Notes) -> list[Recording]:
         """The trajectories under ``source`` as they stand in their tables."""
         options = self.options
         folders = [file.parent for file in sorted(source.rglob("command.csv"))]

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from omnibench.data.delimited import read_numbers
+from omnibench.data.recording import PoseReadings
 from omnibench.errors import DataError
 from omnibench.files import write_text
 from omnibench.robot.kinematics import Array
 from omnibench.robot.wheel_logs import finite_array
-from omnibench.views import Brief
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
@@ -54,27 +54,20 @@ def planar_headings(quaternions: Array) -> PlanarHeadings:
     return PlanarHeadings(headings, lengths, tilts, ~(rotation & (tilts <= _LARGEST_TILT)))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class PoseTrack(Brief):
-    """Planar poses: times (K,) in s as recorded, poses (K, 3) as x, y (m) and heading (rad, within a turn)."""
+def read_tum(file: Path | str) -> PoseReadings:
+    """The planar poses of a TUM file: times (K,) in s, poses (K, 3) as x, y (m) and the yaw (rad) of the quaternion.
 
-    times: Array
-    poses: Array
-
-
-def read_tum(file: Path | str) -> PoseTrack:
-    """The planar poses of a TUM file: x, y and the yaw of the quaternion; z, roll and pitch are left out.
-
-    DataError names file and row when a row is malformed, the time does not increase, a quaternion has no length 1
-    (to 1 %), or the pose is tilted by more than 20 degrees: then it is another frame than the robot's body (z up), for
-    example a camera's. Source: the file format of the TUM RGB-D benchmark, as evo and others write it.
+    z, roll and pitch are left out. DataError names file and row when a row is malformed, the time does not increase, a
+    quaternion has no length 1 (to 1 %), or the pose is tilted by more than 20 degrees: then it is another frame than
+    the robot's body (z up), for example a camera's. Source: the file format of the TUM RGB-D benchmark, as evo and
+    others write it.
     """
     table = read_numbers(Path(file), FIELDS, separator=None, header_lines=0)
     times = table.increasing("timestamp")
     orientations = planar_headings(table.columns(FIELDS[4:]))
     for row in np.flatnonzero(orientations.flawed)[:1]:
         raise table.fail(int(row), orientations.flaw(int(row)))
-    return PoseTrack(times, np.column_stack([table.columns(("tx", "ty")), orientations.headings]))
+    return PoseReadings(times, np.column_stack([table.columns(("tx", "ty")), orientations.headings]), radians=True)
 
 
 def write_tum(file: Path | str, times: ArrayLike, poses: ArrayLike) -> None:

@@ -21,7 +21,7 @@ from tricycle_samples import TRICYCLE, tricycle_drive
 from omnibench.check.check import check
 from omnibench.config import parse_settings
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.finding import findings_of
+from omnibench.data.finding import CounterRestart
 from omnibench.data.importers.csv_template import write_template
 from omnibench.data.importers.dataset_folder import DatasetOptions, recordings_of
 from omnibench.data.importers.tum import write_tum
@@ -564,7 +564,7 @@ def test_a_counter_that_is_set_to_zero_ends_a_run(tmp_path: Path) -> None:
     assert log_error(data, runs=2) < 0.01
     assert [(run.id, run.session) for run in data.trajectories] == [("log#1", "log"), ("log#2", "log")]
     assert "the positions begin anew 1 time, faster than any wheel turns" in data.warnings[0]
-    assert "counter_restart" in {finding.kind for finding in findings_of(data.warnings)}
+    assert any(isinstance(warning, CounterRestart) for warning in data.warnings)
 
 
 @pytest.mark.parametrize(("left", "right"), [([40], [40]), ([40, 90], [60, 61])])
@@ -692,7 +692,7 @@ def test_the_first_guesses_of_another_laboratory_s_tricycle_are_far_off() -> Non
         strict=False,
     ):
         assert part in warning
-    restarts = [finding.what for finding in findings_of(data.warnings) if finding.kind == "counter_restart"]
+    restarts = [warning for warning in data.warnings if isinstance(warning, CounterRestart)]
     assert restarts == [data.warnings[1]]
     (run,) = data.trajectories
     assert (len(run.times), len(run.pose_times)) == (2382, 2434)
@@ -891,6 +891,7 @@ def test_a_data_set_with_times_in_ms_has_its_references_in_seconds_too(tmp_path:
     run = the_run(write(tmp_path / "log", a_wheels=wheel_table(), a_references=table), pose_time_unit="ms")
     slow = replace(run, references=replace(run.references, t0=run.references.t0 * 1e3, t1=run.references.t1 * 1e3))
     options = DatasetOptions(robot=ROBOT, wheel_time_unit="ms", pose_time_unit="ms")
-    recordings = recordings_of([replace(slow, times=run.times * 1e3)], options.robot, None, options)
+    dataset = Dataset("slow", ROBOT, 1.0, (replace(slow, times=run.times * 1e3),))
+    recordings = recordings_of(dataset, options)
     (mended,) = dataset_of(recordings, options, []).trajectories
     assert measured(mended) == [(kind, pytest.approx(t0), pytest.approx(t1), v) for kind, t0, t1, v in measured(run)]
