@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -117,8 +117,10 @@ def calibrate(
     require_type(dataset, Dataset, "load_dataset")
     robot, training = dataset.robot, training_split(dataset)
 
-    # The choices, with what is usual for this robot and these runs.
-    asked = _with_choices(settings, choices)
+    # The choices that are not None in the place of the settings' own, with what is usual for this robot and its runs.
+    if settings is not None:
+        choices = (dict(settings) if isinstance(settings, FitSettings) else {"calibrator": settings}) | choices
+    asked = validate(FitSettings, {name: value for name, value in choices.items() if value is not None}, "calibrate")
     chosen, calibrator = complete_settings(asked, robot, training)
 
     # The steering first, where it is to be fitted: the matrix is then fitted to the corrected drive signals.
@@ -137,40 +139,39 @@ def calibrate(
     if result.matrix is None or result.vector is None:
         raise ConfigError(f"calibrator {calibrator.name!r} gave no answer ({result.outcome}): {result.reason}")
 
-    # How sure it is.
-    uncertainty, without_covariance = None, ""
+    # What the data leave open, and how sure the answer is.
+    searched, span, treatment = problem.parameterisation, problem.span, chosen.unidentified
+    warnings = [*warnings_of_calibration(robot, span, searched.name, treatment)]
+    warnings += open_sentences(robot, runs, treatment, chosen.mount, span=span)
+    if isinstance(searched, WheelGeometry) and calibrator.fitted:
+        warnings += inseparable_in_words(searched, problem.unidentified, problem.left_open)
+    warnings += problem.moved_ends
+    uncertainty = None
     if calibrator.fitted:
         try:
             uncertainty = uncertainty_of(problem, result)
         except NoCovarianceError as error:
-            without_covariance = str(error)
+            warnings.append(str(error))
 
-    # The physical parameters, the calibration file, and what the data leave open.
-    searched = problem.parameterisation
+    # The physical parameters and the calibration file.
     extension = result.extension or ModelExtension(effects=tuple(map(EffectTerm.of, terms)))
     by_prior = calibrator.weighs_design and chosen.tolerance is None
     fitted_mount = mount_is_fitted(robot, asked.mount, by_prior=by_prior)
     reading = physical_parameters(problem, result, uncertainty, extension.effects, fitted_mount=fitted_mount)
+    warnings += [reading.doubt] if reading.doubt else []
+    if terms:
+        warnings.append(
+            f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take these numbers for exact, "
+            "and the file has no covariance"
+        )
     return CalibrationRun(
         calibration=_calibration(dataset, chosen, problem, result, extension, uncertainty, reading),
         result=result,
         parameters=reading.parameters,
         uncertainty=uncertainty,
-        warnings=tuple(_warnings(chosen, calibrator, problem, runs, terms, without_covariance, reading.doubt)),
-        kept=kept_motions(robot, problem.span, searched.name, chosen.unidentified),
+        warnings=tuple(warnings),
+        kept=kept_motions(robot, span, searched.name, treatment),
     )
-
-
-def _with_choices(settings: FitSettings | str | None, choices: dict[str, Any]) -> FitSettings:
-    """Settings, or those of a calibrator by its name, in which choices that are not None replace the fields they name.
-
-    ConfigError: a choice is unknown, or its value is wrong.
-    """
-    if isinstance(settings, FitSettings):
-        choices = dict(settings) | choices
-    elif settings is not None:
-        choices = {"calibrator": settings} | choices
-    return validate(FitSettings, {name: value for name, value in choices.items() if value is not None}, "calibrate")
 
 
 def complete_settings(
@@ -245,33 +246,3 @@ def _calibration(
         **dict(extension) | {"covariance": extension.covariance or covariance},
     )
     return calibration.model_copy(update={"slip": slip_of(calibration, training)})
-
-
-def _warnings(
-    settings: CompleteSettings,
-    calibrator: Calibrator,
-    problem: CalibrationProblem,
-    runs: Sequence[Trajectory],
-    terms: Sequence[Term],
-    without_covariance: str,
-    doubt: str,
-) -> Iterator[str]:
-    """Sentences on what the data leave open, and on what the fit assumes.
-
-    without_covariance: why the calibration has no covariance; empty for one that has. doubt: of the parameters.
-    """
-    robot, searched = problem.robot, problem.parameterisation
-    yield from warnings_of_calibration(robot, problem.span, searched.name, settings.unidentified)
-    yield from open_sentences(robot, runs, settings.unidentified, settings.mount, span=problem.span)
-    if isinstance(searched, WheelGeometry) and calibrator.fitted:
-        yield from inseparable_in_words(searched, problem.unidentified, problem.left_open)
-    yield from problem.moved_ends
-    if without_covariance:
-        yield without_covariance
-    if doubt:
-        yield doubt
-    if terms:
-        yield (
-            f"the steering was fitted first ({words_of(terms)}); the matrix's intervals take these numbers for exact, "
-            "and the file has no covariance"
-        )

@@ -109,7 +109,7 @@ class StampSums:
             raise ConfigError("samples turn too far for a lower bound with arcs; use integration euler")
         self._quadrature = QUADRATURE if integration == "arc" else 0.0
         design = problem.start.reshape(3, -1)
-        self._runs = EachLog(partial(_columns_of, design, fitted, integration, nodes), logs)
+        self._runs = EachLog(partial(_RunColumns, design, fitted, integration, nodes), logs)
         self.curvature = np.concatenate([run.curvature for run in self._runs])
         reaches = [
             ((np.abs(path.angles) @ speed).sum(), (np.abs(path.before) @ row).max(initial=0.0)) for path in paths
@@ -139,17 +139,24 @@ class StampSums:
         return self._quadrature + self._rounding * (1 + turned) ** 2 * (1 + size)
 
 
-@dataclass(frozen=True, eq=False)
 class _RunColumns:
     """A run's impulses, n: columns (n, (2 + r)(1 + r)), phase (n,) at the design, turns (n, r) along the fitted
-    directions, sizes (n, 1 + r) of Eq. (S2); ends (S,): the impulses up to each stamp.
+    directions, sizes (n, 1 + r) of Eq. (S2); ends (S,): the impulses up to each stamp. See StampSums.
     """
 
-    columns: Array
-    phase: Array
-    turns: Array
-    ends: NDArray[np.intp]
-    sizes: Array
+    def __init__(self, design: Array, fitted: Array, integration: Integration, nodes: int, log: WheelLog) -> None:
+        path = make_path(log, integration)
+        # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
+        angles, before = (
+            np.vstack([np.reshape(part, (-1, len(design[0]))), np.zeros((1, len(design[0])))])
+            for part in impulses(path, integration, nodes)
+        )
+        moved, along, self.turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
+        sources = np.column_stack([moved.real, moved.imag, along])
+        self.columns = np.concatenate([sources, *(sources * turn[:, None] for turn in self.turns.T)], axis=1)
+        self.phase = before @ design[2] + float(log.start[2])
+        self.ends: NDArray[np.intp] = path.ends * nodes
+        self.sizes = np.column_stack([np.abs(moved), np.abs(along)])
 
     @property
     def curvature(self) -> Array:
@@ -172,21 +179,6 @@ class _RunColumns:
         )
         between[firsts == ends] = 0.0  # reduceat returns the first row for an empty part
         return np.cumsum(between, axis=0)
-
-
-def _columns_of(design: Array, fitted: Array, integration: Integration, nodes: int, log: WheelLog) -> _RunColumns:
-    """The impulses of a run, see StampSums."""
-    path = make_path(log, integration)
-    nothing = np.zeros((1, design.shape[1]))
-    # One row of zeros more: the sum up to a stamp at the end, or at t = 0, then begins at a row that exists.
-    angles, before = (
-        np.vstack([np.reshape(part, (-1, design.shape[1])), nothing]) for part in impulses(path, integration, nodes)
-    )
-    moved, along, turns = angles @ (design[0] + 1j * design[1]), angles @ fitted.T, before @ fitted.T
-    sources = np.column_stack([moved.real, moved.imag, along])
-    columns = np.concatenate([sources, *(sources * turn[:, None] for turn in turns.T)], axis=1)
-    sizes = np.column_stack([np.abs(moved), np.abs(along)])
-    return _RunColumns(columns, before @ design[2] + float(log.start[2]), turns, path.ends * nodes, sizes)
 
 
 def least_sum_of_norms(
@@ -369,8 +361,7 @@ class LowerBounds:
 
     def vector(self, deviations: Array) -> Array:
         """Deviations (3, r) as a vector (n,) of the problem."""
-        matrix: Array = self._design + deviations @ self._fitted
-        return matrix.ravel()
+        return (self._design + deviations @ self._fitted).ravel()
 
     def _node(self, part: ElementBox, near: Array, proven: float = 0.0) -> Node:
         """A part of the box with its bound; near (3, r): first guess of a good matrix; proven: bound of the whole."""
@@ -544,21 +535,11 @@ def certify_optimum(
 
     known = vector if inside else problem.start
     proof = prove(problem, known, gap=gap, seconds=seconds, parts=parts, watch=foretell, backend=backend)
-    return CertifiedCalibration(
-        Certificate(
-            cost=cost,
-            lower_bound=proof.lower_bound,
-            gap=proven_gap(cost, proof.lower_bound),
-            box=problem.box,
-            seconds=proof.seconds,
-            shrinking=shrinking,
-        ),
-        proof,
-        problem.objective.name,
-        dataset,
-        inside,
-        problem.held,
+    lowest, spent = proof.lower_bound, proof.seconds
+    certificate = Certificate(
+        cost=cost, lower_bound=lowest, gap=proven_gap(cost, lowest), box=problem.box, seconds=spent, shrinking=shrinking
     )
+    return CertifiedCalibration(certificate, proof, problem.objective.name, dataset, inside, problem.held)
 
 
 def proven_gap(cost: float, lower_bound: float) -> float:

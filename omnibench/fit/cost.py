@@ -108,8 +108,7 @@ class SumOfNorms(Cost):
 
     def combine(self, errors: Array, trajectory: NDArray[np.intp]) -> Array:
         """Costs (P,): the norms, weighted by the stamps' shares."""
-        values: Array = self.norms(errors) @ self.shares(trajectory)
-        return values
+        return self.norms(errors) @ self.shares(trajectory)
 
     def norms(self, errors: Array) -> Array:
         """Norms (..., S) of pose errors (..., S, 3)."""

@@ -174,38 +174,28 @@ STEERING = ("steering_gain", "steering_play", "steering_offset", "steering_coupl
 _FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
 
-def steering_unknowns(robot: Robot) -> list[tuple[Unknown, ...]]:
-    """Gain, play and coupling of a robot's steering, or a car's zero; a gain's prior about each of some factors.
-
-    Their plausible ranges are their standard deviations, but a gain's is its factor. A lag is not among them: a wrong
-    clock of the reference looks alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
-    """
-    parameters = [
-        (effect.name, parameter)
-        for effect in map(effects.create, STEERING)
-        if effect.applies(robot)
-        for parameter in effect.parameters(robot)
-    ]
-    if not parameters:
-        raise ConfigError(f"steering: fit is for wheels that steer; robot {robot.name} has none")
-    return [
-        tuple(
-            Unknown(name, parameter.name, factor, factor - 1)
-            if name == STEERING[0]
-            else Unknown(name, parameter.name, parameter.largest)
-            for name, parameter in parameters
-        )
-        for factor in _FACTORS
-    ]
-
-
 def estimate_with_steering(problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True) -> Estimate:
-    """The estimate with the steering's unknowns beside the problem's, about the gain that explains the runs best.
+    """The estimate with the steering's gain, play and coupling, or a car's zero, beside the problem's unknowns.
 
-    ConfigError: the robot has no steering.
+    A gain is looked for about each of some factors, and the one that explains the runs best is taken. The plausible
+    ranges are the prior's standard deviations, but a gain's is its factor. A lag is not among them: a wrong clock of
+    the reference looks alike, and ``discover`` tells when it can. ConfigError: the robot has no steering.
     """
-    tries = [replace(problem, unknowns=(*problem.unknowns, *more)) for more in steering_unknowns(problem.robot)]
-    return min((estimate(tried, may_go_on) for tried in tries), key=lambda tried: tried.error)
+    robot = problem.robot
+    steering = [effect for effect in map(effects.create, STEERING) if effect.applies(robot)]
+    if not steering:
+        raise ConfigError(f"steering: fit is for wheels that steer; robot {robot.name} has none")
+    tries = []
+    for factor in _FACTORS:
+        more = [
+            Unknown(
+                effect.name, number.name, *((factor, factor - 1) if effect.name == STEERING[0] else (number.largest,))
+            )
+            for effect in steering
+            for number in effect.parameters(robot)
+        ]
+        tries.append(estimate(replace(problem, unknowns=(*problem.unknowns, *more)), may_go_on))
+    return min(tries, key=lambda tried: tried.error)
 
 
 def estimate(
@@ -230,7 +220,10 @@ def estimate(
         errors, slopes = rows.linearised(unknowns)
         if steps in (first, _FIRST_STEPS):  # they change by shares of a per cent with the matrix
             drifts = rows.drifts(unknowns)
-        errors = rows.without_nuisances(errors, drifts, weights[:, None] * rows.precisions(excess))
+        if drifts.shape[2]:  # each run's nuisances at their likeliest
+            inner, along = rows.of_nuisances(drifts, weights[:, None] * rows.precisions(excess), errors[..., None])
+            likeliest = -np.linalg.solve(inner, along)[..., 0]
+            errors = errors + np.einsum("scm,sm->sc", drifts, likeliest[rows.run])
         if steps >= _FIRST_STEPS:
             excess = rows.excess(errors, weights)
         weights = loss.weights(np.sqrt(np.nansum(np.square(errors) / rows.variances(excess), axis=1)))
@@ -344,7 +337,13 @@ class _Rows:
         for logs, firsts, seen in self._driven(terms):
             odometry = OdometryBatch(logs, self._problem.integration)
             poses = odometry.poses(matrix[None])[0]
-            errors += list(_medians(poses - seen, firsts))
+            # The medians of each stretch, those of one length at once
+            counts = np.diff([*firsts, len(poses)])
+            medians, apart = np.empty((len(firsts), 3)), poses - seen
+            for count in np.unique(counts).tolist():
+                alike = np.flatnonzero(counts == count)
+                medians[alike] = np.median(apart[firsts[alike][:, None] + np.arange(count)], axis=1)
+            errors += list(medians)
             if slopes:
                 jacobians.append(_means(odometry.jacobian(matrix).reshape(len(poses), 3, -1), firsts))
         if self._references is not None:
@@ -398,14 +397,6 @@ class _Rows:
         """1/v (S, 3) of Eq. (2); 0 where nothing was measured."""
         return np.nan_to_num(1 / (np.square(self.sigmas) + self._together * np.square(excess)[self._kind]))
 
-    def without_nuisances(self, errors: Array, drifts: Array, precisions: Array) -> Array:
-        """Errors (S, 3) with each run's nuisances at their likeliest."""
-        if not drifts.shape[2]:
-            return errors
-        inner, along = self._of_nuisances(drifts, precisions, errors[..., None])
-        values = -np.linalg.solve(inner, along)[..., 0]
-        return errors + np.einsum("scm,sm->sc", drifts, values[self.run])
-
     def normal_equations(self, errors: Array, slopes: Array, drifts: Array, precisions: Array) -> tuple[Array, Array]:
         """Hessians (Z, k, k) and slopes (Z, k) of half of the runs' parts of Eq. (3), nuisances eliminated.
 
@@ -416,7 +407,7 @@ class _Rows:
         scores = self._by_run(np.einsum("sci,sc->si", columns, errors * roots))
         information = self._by_run(np.einsum("sci,scj->sij", columns, columns))
         if drifts.shape[2]:
-            inner, along = self._of_nuisances(drifts, precisions, slopes)
+            inner, along = self.of_nuisances(drifts, precisions, slopes)
             information = information - np.swapaxes(along, 1, 2) @ np.linalg.solve(inner, along)
         return information, scores
 
@@ -439,7 +430,7 @@ class _Rows:
         inner, beside = sums[:, count:, count:] + np.eye(drifts.shape[2]), sums[:, count:, :count]
         return sums[:, :count, :count] - np.swapaxes(beside, 1, 2) @ np.linalg.solve(inner, beside)
 
-    def _of_nuisances(self, drifts: Array, precisions: Array, slopes: Array) -> tuple[Array, Array]:
+    def of_nuisances(self, drifts: Array, precisions: Array, slopes: Array) -> tuple[Array, Array]:
         """1 + N'PN (Z, m, m) and N'P J (Z, m, k) for the columns N of nuisances and J of others."""
         weighted = drifts * precisions[..., None]
         inner = self._by_run(np.einsum("sci,scj->sij", weighted, drifts)) + np.eye(drifts.shape[2])
@@ -456,15 +447,6 @@ def _means(values: Array, firsts: NDArray[np.intp]) -> Array:
     """Means (S, ...) of values (K, ...) over stretches that begin at ``firsts``."""
     counts = np.diff([*firsts, len(values)]).reshape(-1, *(1,) * (values.ndim - 1))
     return np.asarray(np.add.reduceat(values, firsts, axis=0) / counts)
-
-
-def _medians(values: Array, firsts: NDArray[np.intp]) -> Array:
-    """Medians (S, n) of values (K, n) over stretches that begin at ``firsts``."""
-    counts, medians = np.diff([*firsts, len(values)]), np.empty((len(firsts), values.shape[1]))
-    for count in np.unique(counts).tolist():  # those of one length at once
-        alike = np.flatnonzero(counts == count)
-        medians[alike] = np.median(values[firsts[alike][:, None] + np.arange(count)], axis=1)
-    return medians
 
 
 def _chosen(poses: int, stretches: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -85,9 +85,18 @@ def judge(
     names = ", ".join(run.id for run in runs[:_SHOWN])
     if len(runs) > _SHOWN:
         names += f" and {len(runs) - _SHOWN} more"
-    meaning = (
-        _MEANINGS[verdict] if verdict != "undecided" else _undecided(gain, units, same=bool((costs == before).all()))
-    )
+    if verdict != "undecided":
+        meaning = _MEANINGS[verdict]
+    elif (costs == before).all():
+        meaning = "the same as the design"
+    elif gain is None:
+        meaning = "undecided: the design values have no error there to be improved"
+    elif units.count < FEWEST:
+        meaning = f"undecided: {plural(units.count, units.name)} cannot show it, hold out {FEWEST} or more"
+    elif gain.known is None:
+        meaning = f"undecided: the {noun_for(units.count, units.name)} differ too much for an interval"
+    else:
+        meaning = "undecided: chance alone can explain the difference"
     return HeldOutVerdict(
         basis=basis,
         verdict=verdict,
@@ -107,29 +116,15 @@ def judge(
     )
 
 
-def _undecided(gain: Interval | None, units: Clusters, same: bool) -> str:
-    """Why held-out runs leave it undecided whether the calibration is better or worse."""
-    if same:
-        return "the same as the design"
-    if gain is None:
-        return "undecided: the design values have no error there to be improved"
-    if units.count < FEWEST:
-        return f"undecided: {plural(units.count, units.name)} cannot show it, hold out {FEWEST} or more"
-    if gain.known is None:
-        return f"undecided: the {noun_for(units.count, units.name)} differ too much for an interval"
-    return "undecided: chance alone can explain the difference"
-
-
 def _gain_in_words(gain: Interval | None, units: Clusters) -> str:
     """The improvement of Eq. (6) with its interval and what that rests on; empty where there is none."""
     if gain is None:
         return ""
-    basis = units.ratio_words
+    basis, falls = units.ratio_words, gain.value >= 0
     if gain.known is not None:
-        low, high = sorted(end if gain.value >= 0 else -end for end in gain.known)
-        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {units.ratio_words}"
-    direction = "falls" if gain.value >= 0 else "rises"
-    return f"the final error, Eq. (6), {direction} by {100 * abs(gain.value):.1f} % ({basis}); "
+        low, high = sorted(end if falls else -end for end in gain.known)
+        basis = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %, {basis}"
+    return f"the final error, Eq. (6), {'falls' if falls else 'rises'} by {100 * abs(gain.value):.1f} % ({basis}); "
 
 
 def _change(before: float, after: float, unit: str) -> str:
@@ -206,8 +201,7 @@ def evaluate(calibration: Calibration, dataset: Dataset) -> Evaluation:
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
-    present = {split: dataset.split(split) for split in SPLITS if dataset.split(split)}
-    groups: dict[str, tuple[Trajectory, ...]] = {str(name): group for name, group in present.items()}
+    groups: dict[str, tuple[Trajectory, ...]] = {split: group for split in SPLITS if (group := dataset.split(split))}
     groups["all"] = dataset.trajectories
     design = OdometryModel.of_design(dataset.robot, calibration.integration)
     fitted, designed = (ModelErrors.of(model, dataset.trajectories) for model in (calibration.model, design))
@@ -259,8 +253,8 @@ def _held_out(calibration: Calibration, dataset: Dataset) -> tuple[Sequence[Traj
         digits = None if len(wheels) < len(fitted) else DIGITS
         seen = fitted if digits is None else wheels
         runs = tuple(run for run in dataset.trajectories if run.fingerprint[:digits] not in seen)
-        samples = "the wheel samples of a run that the calibration was fitted to"
-        return runs, "" if runs else f"every run of {dataset.name} has {samples}"
+        again = f"every run of {dataset.name} has the wheel samples of a run that the calibration was fitted to"
+        return runs, "" if runs else again
     if provenance.dataset == dataset.name:
         changed = f"the data set {dataset.name} or its split was changed after the fit"
         return None, f"{changed}, so that which runs were fitted is not known"
@@ -309,7 +303,10 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
         return verdict
     problem = usual_problem(model.robot, every, model.integration)
     whole = estimate(problem)
-    if not _gains_as_much(model, whole.model(problem), every):
+    # The default estimate says how the model does if the model gains at least nine tenths as much on all runs.
+    models = (design, whole.model(problem), model)
+    plain, usual, ours = (float(np.linalg.norm(final_errors(each, every), axis=1).mean()) for each in models)
+    if not (plain - ours >= _AS_GOOD * (plain - usual) if usual < plain else ours >= plain):
         return verdict
     part_of = {name: number % _PARTS for number, name in enumerate(sorted(set(names)))}
     errors, parts = [], list[Trajectory]()
@@ -327,13 +324,6 @@ def verdict_on(model: OdometryModel, training: Sequence[Trajectory], held_out: S
         beside = f"too little was held out to decide: {verdict.sentence}"
     manner = f"{crossed.unit}s were left out by turns and predicted by estimates from the others; {beside}"
     return crossed.model_copy(update={"detail": f"{crossed.detail.rpartition('; ')[0]}; {manner}"})
-
-
-def _gains_as_much(model: OdometryModel, estimated: OdometryModel, runs: Sequence[Trajectory]) -> bool:
-    """True if the default estimate says how a model does: the model gains at least nine tenths as much."""
-    models = (OdometryModel.of_design(model.robot, model.integration), estimated, model)
-    design, usual, fitted = (float(np.linalg.norm(final_errors(each, runs), axis=1).mean()) for each in models)
-    return design - fitted >= _AS_GOOD * (design - usual) if usual < design else fitted >= design
 
 
 def looked_at(runs: Sequence[Trajectory]) -> list[Trajectory]:

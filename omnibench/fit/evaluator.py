@@ -142,14 +142,11 @@ class DrivenFrame:
         rest = np.broadcast_to(np.eye(3), (len(matrices), 3, 3))
         return np.concatenate([matrices @ self.driven.T, rest], axis=2)
 
-    def logs(self, logs: Sequence[WheelLog]) -> list[WheelLog]:
-        """Logs whose signals are those of the frame."""
-        moved = []
-        for log in logs:
-            along = log.signals @ self.driven.T
-            rest = (log.signals - along @ self.driven) @ self.design.T
-            moved.append(replace(log, rates=np.hstack([along, rest]), wheel_angles=None, steering=None, drive=None))
-        return moved
+    def log(self, log: WheelLog) -> WheelLog:
+        """A log whose signals are those of the frame."""
+        along = log.signals @ self.driven.T
+        rest = (log.signals - along @ self.driven) @ self.design.T
+        return replace(log, rates=np.hstack([along, rest]), wheel_angles=None, steering=None, drive=None)
 
 
 @dataclass(frozen=True)
@@ -306,8 +303,16 @@ def _bessel(angles: Array, degree: int) -> Array:
     half = angles / 2
     square = half * half
     scaled: Array = np.empty((len(angles), degree + 2, angles.shape[1]))
-    for order in (degree + 1, degree):
-        scaled[:, order] = _power_series(order, square)
+    largest = float(square.max(initial=0.0))
+    for order in (degree + 1, degree):  # sum_m (-square)^m / (m! (order + m)!), to rounding
+        terms = 1
+        while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > _LAST_TERM:
+            terms += 1
+        total = np.full(square.shape, 1.0 / (factorial(terms) * factorial(order + terms)))
+        for m in range(terms - 1, -1, -1):
+            total *= -square
+            total += 1.0 / (factorial(m) * factorial(order + m))
+        scaled[:, order] = total
     for order in range(degree, 0, -1):
         scaled[:, order - 1] = order * scaled[:, order] - square * scaled[:, order + 1]
     power = 2 * half
@@ -315,19 +320,6 @@ def _bessel(angles: Array, degree: int) -> Array:
         scaled[:, order] *= power
         power = power * half
     return scaled[:, : degree + 1]
-
-
-def _power_series(order: int, square: Array) -> Array:
-    """sum_m (-square)^m / (m! (order + m)!), to rounding."""
-    largest = float(square.max(initial=0.0))
-    terms = 1
-    while largest**terms / (factorial(terms) * factorial(order + terms)) * factorial(order) > _LAST_TERM:
-        terms += 1
-    total = np.full(square.shape, 1.0 / (factorial(terms) * factorial(order + terms)))
-    for m in range(terms - 1, -1, -1):
-        total *= -square
-        total += 1.0 / (factorial(m) * factorial(order + m))
-    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,12 +535,7 @@ class RunsEvaluator:
 
     @classmethod
     def of(
-        cls,
-        logs: Sequence[WheelLog],
-        integration: Integration,
-        searched: Parameterisation,
-        lower: Array,
-        upper: Array,
+        cls, logs: Sequence[WheelLog], integration: Integration, searched: Parameterisation, lower: Array, upper: Array
     ) -> RunsEvaluator | None:
         """The evaluator for the matrices of vectors between ``lower`` and ``upper`` (n,).
 
@@ -561,7 +548,7 @@ class RunsEvaluator:
             frame = DrivenFrame(directions[len(searched.null) :], searched.robot.inverse_kinematic_matrix)
         box, parts = ElementBox.of(searched, lower, upper, frame), []
         for part in parts_of(logs):
-            seen = part if frame is None else frame.logs(part)
+            seen = part if frame is None else [frame.log(log) for log in part]
             evaluator = make_evaluator(OdometryBatch(seen, integration), seen, integration, box)
             if evaluator is None:
                 return None

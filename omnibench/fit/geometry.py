@@ -94,18 +94,11 @@ class WheelGeometry:
     def bounds(self) -> Bounds:
         skidding = GeometryLimits(distance=_SKIDDING) if kinematics.class_of(self.robot) == "skid" else GeometryLimits()
         limits = self.limits or skidding
-        ranges = {
-            "radius": deviation_range(limits.radius),
-            "distance": deviation_range(limits.distance),
-            "angle": np.radians(deviation_range(limits.angle_deg)),
-            "wheelbase": deviation_range(limits.distance),
-            "x": deviation_range(limits.distance),
-            "y": deviation_range(limits.distance),
-            "offset": np.radians(deviation_range(limits.offset_deg)),
-            "mount_x": deviation_range(limits.mount),
-            "mount_y": deviation_range(limits.mount),
-            "mount_yaw": np.radians(deviation_range(limits.yaw_deg)),
-        }
+        shares = dict.fromkeys(("distance", "wheelbase", "x", "y"), limits.distance) | {"radius": limits.radius}
+        shares |= dict.fromkeys(("mount_x", "mount_y"), limits.mount)
+        degrees = {"angle": limits.angle_deg, "offset": limits.offset_deg, "mount_yaw": limits.yaw_deg}
+        ranges = {kind: np.array(deviation_range(limit)) for kind, limit in shares.items()}
+        ranges |= {kind: np.radians(deviation_range(limit)) for kind, limit in degrees.items()}
         low, high = np.array([ranges[number.kind] for number in self._numbers]).T
         box = Bounds("limits", self.start + low * self.scale, self.start + high * self.scale)
         return checked(box, self.names, self.start)
@@ -124,7 +117,7 @@ class WheelGeometry:
 
     def _completed(self, vectors: kinematics.Array) -> kinematics.Array:
         """Vectors (P, n) with the numbers that are not searched."""
-        completed: kinematics.Array = np.tile(self._every.design, (len(vectors), 1))
+        completed = np.tile(self._every.design, (len(vectors), 1))
         completed[:, self._searched] = vectors
         return completed
 

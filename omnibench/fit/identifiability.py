@@ -12,7 +12,7 @@ from omnibench.errors import DataError
 from omnibench.fit import span as spans
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.linear_fit import linear_fit
-from omnibench.fit.noise import GIVEN, NoiseEstimate, roots_of
+from omnibench.fit.noise import GIVEN, roots_of
 from omnibench.fit.open_combinations import information_of_references, open_sentences, with_open_combinations
 from omnibench.fit.parameterisation import MatrixElements, ParameterisationName
 from omnibench.fit.prior import default_mount
@@ -47,8 +47,7 @@ def known_slopes(geometry: WheelGeometry, kept: Array, left_open: Array | None =
     left_open (r, 3M): combinations of elements that are unknown, too, as MatrixElements has them.
     """
     known = MatrixElements(geometry.robot, "row", kept, known_mount=False, open=left_open).projection
-    slopes: Array = known @ geometry.slopes(geometry.start) * geometry.scale
-    return slopes
+    return known @ geometry.slopes(geometry.start) * geometry.scale
 
 
 def identified_parameters(geometry: WheelGeometry, kept: Array, left_open: Array | None = None) -> tuple[bool, ...]:
@@ -108,8 +107,7 @@ def _unseen_changes(geometry: WheelGeometry, kept: Array, left_open: Array | Non
     slopes = known_slopes(geometry, kept, left_open) / rows[:, None]
     _, strengths, directions = np.linalg.svd(np.vstack([slopes, np.zeros((slopes.shape[1], slopes.shape[1]))]))
     unidentified = directions[strengths <= max(_NO_CHANGE * strengths[0], _ROUNDING)]
-    projection: Array = unidentified.T @ unidentified
-    return projection
+    return unidentified.T @ unidentified
 
 
 def open_directions(directions: Sequence[spans.WheelDirection]) -> Iterator[str]:
@@ -239,9 +237,16 @@ def identifiability(
     a quick linear fit. span: what the runs drive; default: computed here. DataError when there are no trajectories.
     """
     span = span or spans.driven_span(trajectories)
-    estimate, matrix = _quick_noise(robot, trajectories, span, integration)
+    # Noise of the poses by a linear fit, in which undriven directions keep the design values.
     posed = [run for run in trajectories if run.has_poses]
-    information = information_of_runs(posed, matrix, integration, estimate.noise).sum(axis=0)
+    noise, matrix = GIVEN, robot.inverse_kinematic_matrix
+    if posed:
+        odometry = odometry_of([run.reference_log for run in posed], integration)
+        matrix = linear_fit(odometry, posed, np.concatenate([run.poses[1:] for run in posed]), matrix, span.driven)
+        noise = noise_of_matrix(posed, matrix, integration)
+    elif all(run.references is None for run in trajectories):
+        raise DataError("no trajectory has a reference pose after its start; nothing can be identified")
+    information = information_of_runs(posed, matrix, integration, noise.noise).sum(axis=0)
     if measured := [run for run in trajectories if run.references is not None]:
         information = information + information_of_references(robot, measured, integration, poses=False)
     rows = robot.row_scales
@@ -259,7 +264,8 @@ def identifiability(
         for each in every
     )
     # The physical parameters, the matrix being unknown along unidentified directions and open combinations.
-    kept, geometry = spans.unidentified_directions(robot, span), _geometry(robot)
+    kept = spans.unidentified_directions(robot, span)
+    geometry = WheelGeometry(robot, fitted_mount=default_mount(robot) == "fit")
     left_open = with_open_combinations(MatrixElements(robot, "row", kept, known_mount=False), trajectories).open
     told = identified_parameters(geometry, kept, left_open)
     slopes = known_slopes(geometry, kept, left_open)
@@ -270,16 +276,20 @@ def identifiability(
         )
         for name, value, told, deviation in zip(geometry.names, geometry.start, told, of_parameters, strict=True)
     )
+    # Parameters that these recordings do not identify, but others could.
+    _, _, spanned = np.linalg.svd(robot.inverse_kinematic_matrix)
+    ever = identified_parameters(geometry, spanned[len(robot.motions) :])
+    missing = [each.name for each, could in zip(parameters, ever, strict=True) if could and not each.told]
     return Identifiability(
         directions=directions,
         parameters=parameters,
-        noise=estimate.noise,
-        noise_source=estimate.description,
+        noise=noise.noise,
+        noise_source=noise.description,
         sentences=(
             *open_directions(every),
             *open_sentences(robot, trajectories, span=span),
             *_rough_rows(directions),
-            *_open_parameters(robot, parameters),
+            *([f"of the wheels' geometry these recordings do not tell {', '.join(missing)}"] if missing else []),
         ),
     )
 
@@ -302,32 +312,6 @@ def _rough_rows(directions: Sequence[DirectionIdentifiability]) -> Iterator[str]
             )
 
 
-def _open_parameters(robot: Robot, parameters: Sequence[ParameterIdentifiability]) -> Iterator[str]:
-    """A sentence about physical parameters that these recordings do not identify, but others could."""
-    _, _, directions = np.linalg.svd(robot.inverse_kinematic_matrix)
-    ever = identified_parameters(_geometry(robot), directions[len(robot.motions) :])
-    missing = [
-        parameter.name for parameter, could in zip(parameters, ever, strict=True) if could and not parameter.told
-    ]
-    if missing:
-        yield f"of the wheels' geometry these recordings do not tell {', '.join(missing)}"
-
-
-def _quick_noise(
-    robot: Robot, trajectories: Sequence[Trajectory], span: spans.DrivenSpan, integration: Integration
-) -> tuple[NoiseEstimate, Array]:
-    """Noise of the poses by a linear fit, and the fit's matrix (3, N). Undriven directions keep the design values."""
-    usable = [run for run in trajectories if run.has_poses]
-    if not usable and any(run.references is not None for run in trajectories):
-        return GIVEN, robot.inverse_kinematic_matrix
-    if not usable:
-        raise DataError("no trajectory has a reference pose after its start; nothing can be identified")
-    odometry = odometry_of([run.reference_log for run in usable], integration)
-    reference = np.concatenate([run.poses[1:] for run in usable])
-    matrix = linear_fit(odometry, usable, reference, robot.inverse_kinematic_matrix, span.driven)
-    return noise_of_matrix(usable, matrix, integration), matrix
-
-
 def deviations_along(information: Array, directions: Array) -> Array:
     """Standard deviations (q, 3) of the three rows along orthonormal directions (q, N) that are fitted together.
 
@@ -337,12 +321,4 @@ def deviations_along(information: Array, directions: Array) -> Array:
     # Inverse of an information matrix; huge but finite in directions without information
     values, vectors = np.linalg.eigh(basis @ information @ basis.T)
     values = np.maximum(values, _OPEN * max(float(values.max(initial=0.0)), 1e-300))
-    inverse: Array = (vectors / values) @ vectors.T
-    variances = np.diag(inverse)
-    deviations: Array = np.sqrt(variances).reshape(3, -1).T
-    return deviations
-
-
-def _geometry(robot: Robot) -> WheelGeometry:
-    """The geometry that is fitted by default."""
-    return WheelGeometry(robot, fitted_mount=default_mount(robot) == "fit")
+    return np.sqrt(np.diag((vectors / values) @ vectors.T)).reshape(3, -1).T

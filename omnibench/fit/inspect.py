@@ -86,7 +86,6 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     training = marked or trajectories
     span = driven_span(training)
     identifiable = identifiability(dataset.robot, training, span=span)
-    undriven = tuple(direction_in_words(direction, dataset.robot.drive.names) for direction in span.null)
     kinds = [kind for run in trajectories if run.references is not None for kind in run.references.kinds.tolist()]
     findings = list(identifiable.sentences)
     if not marked:
@@ -98,8 +97,9 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
     scanned = None if dataset.scans is None else set(dataset.scans.trajectories)
     if bare := [run.id for run in trajectories if scanned is not None and run.id not in scanned]:
         have = "has" if len(bare) == 1 else "have"
-        shown = ", ".join(bare[:3])
-        findings.append(f"{plural(len(bare), 'trajectory')} {have} no scans, e.g. {shown}: SLAM needs them")
+        findings.append(
+            f"{plural(len(bare), 'trajectory')} {have} no scans, e.g. {', '.join(bare[:3])}: SLAM needs them"
+        )
     return Inspection(
         dataset=dataset.name,
         description=dataset.description,
@@ -121,7 +121,7 @@ def inspect_dataset(dataset: Dataset) -> Inspection:
         splits={split: _content(dataset, split) for split in SPLITS if dataset.split(split)},
         driven_directions=len(span.driven),
         driven_shares=tuple(span.shares.tolist()),
-        undriven=undriven,
+        undriven=tuple(direction_in_words(direction, dataset.robot.drive.names) for direction in span.null),
         identifiability=identifiable,
         findings=tuple(findings),
         warnings=dataset.warnings,
@@ -149,10 +149,10 @@ def _content(dataset: Dataset, split: Split) -> SplitContent:
 def _scans(scans: Scans) -> ScansContent:
     scanner = scans.scanner
     periods, count, seen = [np.zeros(0)], 0, 0
-    for _, scans_of_run in scans:
-        periods.append(np.diff(scans_of_run.times))
-        count += len(scans_of_run.times)
-        seen += sum(int(scanner.valid(ranges).sum()) for ranges in scans_of_run.ranges)
+    for _, of_run in scans:
+        periods.append(np.diff(of_run.times))
+        count += len(of_run.times)
+        seen += sum(int(scanner.valid(ranges).sum()) for ranges in of_run.ranges)
     steps = np.concatenate(periods)
     return ScansContent(
         trajectories=len(scans.trajectories),

@@ -341,9 +341,8 @@ class RatioIntervals:
         if before.mean() <= rounding:
             return None
         ratio = self.ratio(values, before, units)
-        if ratio.low is None or ratio.high is None:
-            return Interval(1 - ratio.value, None, None)
-        return Interval(1 - ratio.value, 1 - ratio.high, 1 - ratio.low)
+        low, high = (None, None) if ratio.known is None else (1 - ratio.known[1], 1 - ratio.known[0])
+        return Interval(1 - ratio.value, low, high)
 
 
 def _jackknifed(ratio: float, upper: Array, lower: Array, logarithm: bool) -> Interval:

@@ -200,8 +200,7 @@ class StudentT(ScaledLoss):
 
 def make_loss(name: LossName, coordinates: int) -> Loss:
     """The loss of that name for errors of some coordinates."""
-    kinds: dict[LossName, type[Loss]] = {"squares": Loss, "huber": Huber, "student_t": StudentT}
-    return kinds[name](coordinates)
+    return next(kind for kind in (Loss, Huber, StudentT) if kind.name == name)(coordinates)
 
 
 def with_ends_from_others(

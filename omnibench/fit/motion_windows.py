@@ -48,7 +48,10 @@ class MotionWindows:
         windows, motions, numbers = [], [], []
         for index, (run, (times, posed)) in enumerate(zip(runs, parts, strict=True)):
             steps = len(times) - 1
-            drive[index, :steps], durations[index, :steps] = _means(run, times), np.diff(times)
+            # Means of the drive signals between the edges, by interpolation of their integrals.
+            bounds, durations[index, :steps] = np.append(0.0, run.times), np.diff(times)
+            driven = np.vstack([np.zeros(signals), np.cumsum(run.signals * np.diff(bounds)[:, None], axis=0)])
+            drive[index, :steps] = np.diff(interpolated(times, bounds, driven), axis=0) / np.diff(times)[:, None]
             poses = interpolated(times[posed], run.pose_times, run.poses)
             for number, length in enumerate(lengths):
                 for first, last in _pairs(times[posed], length):
@@ -86,14 +89,6 @@ def _edges(stamps: Array, step: float) -> tuple[Array, NDArray[np.intp]]:
     pieces = np.maximum(np.ceil(np.diff(edges) / (_LONGEST * step) - 1e-6), 1).astype(int)
     posed = np.append(0, np.cumsum(pieces))
     return np.interp(np.arange(posed[-1] + 1), posed, edges), posed
-
-
-def _means(run: Trajectory, times: Array) -> Array:
-    """Means (J, M) of a run's drive signals between edges (J + 1,), rad/s."""
-    bounds = np.append(0.0, run.times)
-    driven = np.cumsum(run.signals * np.diff(bounds)[:, None], axis=0)
-    of_edges = interpolated(times, bounds, np.vstack([np.zeros(driven.shape[1]), driven]))
-    return np.asarray(np.diff(of_edges, axis=0) / np.diff(times)[:, None])
 
 
 def _pairs(times: Array, length: float) -> list[tuple[int, int]]:

@@ -354,15 +354,11 @@ class _Factor:
 
     def left_out(self, residuals: Array) -> tuple[Array, Array]:
         """Errors (K, n) less what the others say of them, and their variances (K,); see Whitener."""
-        solved = self._solved(residuals)
+        solved = self.transposed(self.whiten(_differences(residuals)))  # by the inverse covariance of the differences
         solved[:-1] -= solved[1:]
         inner, beside = self._inverse_bands()
         inner[:-1] += inner[1:] - 2 * beside
         return solved / inner[:, None], 1 / inner
-
-    def _solved(self, residuals: Array) -> Array:
-        """The covariance of the differences, inverted, times the differences of residuals (K, n)."""
-        return self.transposed(self.whiten(_differences(residuals)))
 
     def _inverse_bands(self) -> tuple[Array, Array]:
         """Diagonal (K,) and upper diagonal (K - 1,) of the inverse of the covariance C of the differences.

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.data.references import UNITS
 from omnibench.fit.geometry import Parameterisation
 from omnibench.fit.parameterisation import MatrixElements
 from omnibench.fit.prior import MountChoice, default_mount
-from omnibench.fit.reference_rows import ReferenceBatch, reference_rows
+from omnibench.fit.reference_rows import ReferenceBatch, measured_parts, reference_rows
 from omnibench.fit.span import DrivenSpan, Treatment, directions_kept, driven_span
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.odometry import Integration
@@ -61,8 +60,7 @@ def information_of_references(
     design = robot.inverse_kinematic_matrix
     jacobian = ReferenceBatch(rows, integration).jacobian(design).reshape(len(rows.trajectory), 3, -1)
     columns = (jacobian * weights[..., None]).reshape(-1, design.size)
-    information: Array = columns.T @ columns
-    return information
+    return columns.T @ columns
 
 
 def open_directions(searched: MatrixElements, information: Array) -> Array:
@@ -72,8 +70,7 @@ def open_directions(searched: MatrixElements, information: Array) -> Array:
     allowed = basis.U[:, basis.S > _SHARE]
     columns = units[:, None] * allowed
     values, vectors = np.linalg.eigh(columns.T @ information @ columns)
-    directions: Array = (allowed @ vectors[:, values < WORST**-2.0]).T
-    return directions
+    return (allowed @ vectors[:, values < WORST**-2.0]).T
 
 
 def open_sentences(
@@ -90,20 +87,16 @@ def open_sentences(
     kept = directions_kept(robot, span or driven_span(runs), treatment)
     searched = MatrixElements(robot, "row", kept, (mount or default_mount(robot)) == "known")
     searched = with_open_combinations(searched, runs)
-    end = "rests on the design and its tolerance" if treatment == "weigh" else "keeps the design values"
-    return tuple(_sentences(searched, runs, end))
+    weighed = treatment == "weigh"
+    one = "rests on the design and its tolerance" if weighed else "keeps the design values"
+    several = "rest on the design and its tolerance" if weighed else "keep the design values"
+    return tuple(_sentences(searched, runs, one, several))
 
 
-def _of_several(end: str) -> str:
-    """The end of a sentence on several things: keep and rest for keeps and rests."""
-    return end.replace("keeps ", "keep ").replace("rests ", "rest ")
-
-
-def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -> Iterator[str]:
-    angles = any(run.has_poses or _has(run, "rad") for run in runs)
+def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], one: str, several: str) -> Iterator[str]:
     left = searched.open
     if left is None or not len(left):
-        if not angles:
+        if not measured_parts(runs)[1].any():
             yield (
                 "no reference tells the heading: row 3 (heading) is known only through the places that the robot "
                 "reached on curves; measure turned angles (kind turn) to know it better"
@@ -112,18 +105,20 @@ def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -
     signals = searched.start.size // 3
     driven = np.linalg.svd(np.eye(signals) - searched.null.T @ searched.null)
     motions = driven.U[:, driven.S > 0.5].T  # directions of drive signals along which the matrix is searched
-    shares = [_share(left, row, motions) for row in range(3)]
+    # The combinations (3, q, 3M) of elements that are a row's along the motions, and their squared shares (3, q).
+    parts = np.einsum("rs,qm->rqsm", np.eye(3), motions).reshape(3, len(motions), -1)
+    shares = [[float(np.square(left @ part).sum()) for part in of_row] for of_row in parts]
     said = np.zeros((0, left.shape[1]))
     if min(shares[2]) > _MOST:
-        said = np.vstack([said, *[_element(left, 2, motion) for motion in motions]])
+        said = np.vstack([said, parts[2]])
         yield (
-            f"no reference tells of turning: row 3 (heading) of the matrix {end}; measure turned angles (kind turn), "
+            f"no reference tells of turning: row 3 (heading) of the matrix {one}; measure turned angles (kind turn), "
             "headings, or where the robot ends after curves (kind displacement)"
         )
     if min(shares[0]) > _MOST and (not searched.rows[1, 1] or min(shares[1]) > _MOST):
-        said = np.vstack([said, *[_element(left, row, motion) for row in (0, 1) for motion in motions]])
+        said = np.vstack([said, parts[0], parts[1]])
         yield (
-            f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {_of_several(end)}; "
+            f"no reference tells of lengths: rows 1 (x) and 2 (y) of the matrix {several}; "
             "measure distances or displacements"
         )
     # The change (3M,) of the elements, in units of their rows' largest, when the robot's frame is turned
@@ -134,30 +129,13 @@ def _sentences(searched: MatrixElements, runs: Sequence[Trajectory], end: str) -
         said = np.vstack([said, turned])
         yield (
             "no reference tells which way the robot's x axis points: distances, and positions in a frame in which the "
-            f"start is not known, are the same for all of them; the direction of x {end}; measure a displacement "
+            f"start is not known, are the same for all of them; the direction of x {one}; measure a displacement "
             "from the start"
         )
     rest = len(left) - int(np.linalg.matrix_rank(left @ said.T, tol=0.3)) if len(said) else len(left)
     if rest > 0:
         yield (
             f"{plural(rest, 'further combination' if len(said) else 'combination')} of matrix elements that the "
-            f"references tell to worse than 10 % {end if rest == 1 else _of_several(end)}: "
+            f"references tell to worse than 10 % {one if rest == 1 else several}: "
             "drive other motions, or measure more exactly"
         )
-
-
-def _has(run: Trajectory, unit: str) -> bool:
-    return run.references is not None and any(UNITS[kind] == unit for kind in run.references.kinds.tolist())
-
-
-def _share(left: Array, row: int, motions: Array) -> list[float]:
-    """Squared shares of a row's parts along motions (q, M) in the open combinations."""
-    return [float(np.square(left @ _element(left, row, motion)).sum()) for motion in motions]
-
-
-def _element(left: Array, row: int, motion: Array) -> Array:
-    """The combination (3M,) of elements that is a row's along a motion (M,)."""
-    element = np.zeros((3, len(motion)))
-    element[row] = motion
-    assert element.size == left.shape[1]
-    return element.ravel()

@@ -59,6 +59,7 @@ _STEP = 1e-3  # of an effect's parameter in its standard deviations, for derivat
 _GRID = 200  # points a side of the grid of equal probabilities on which regions are computed: to 0.3 %
 _REGION = 0.95  # probability of the regions, by convention
 _QUANTILE = (1 + _REGION) / 2
+_SIZES = ("position_m", "position_95_m", "heading_rad", "heading_95_rad")
 
 
 class PathError(Model):
@@ -119,19 +120,11 @@ def calibration_covariances(calibration: Calibration, logs: Sequence[WheelLog]) 
     """Covariances (Z, 3, 3) of the ends of logs by what is not known of a calibration, Eq. (1); 0 if untold."""
     if calibration.covariance is None:
         return np.zeros((len(logs), 3, 3))
-    covariance = np.array(calibration.covariance)
-    slopes = _slopes(calibration.model, logs, covariance)
-    return np.asarray(slopes @ covariance @ np.swapaxes(slopes, 1, 2))
-
-
-def _slopes(model: OdometryModel, logs: Sequence[WheelLog], covariance: Array) -> Array:
-    """J (Z, 3, n) of Eq. (1): derivatives of the logs' ends by the matrix elements and the effects' parameters."""
-    robot, terms = model.robot, model.motion_terms
-    true = list(logs)
-    if terms:
-        assert model.sample_period is not None  # there are terms
-        signals = driven_signals(terms, logs, robot, model.matrix, model.sample_period)
+    covariance, model, true = np.array(calibration.covariance), calibration.model, list(logs)
+    if terms := model.motion_terms:
+        signals = driven_signals(terms, logs, model.robot, model.matrix, calibration.sample_period)
         true = [WheelLog(log.times, driven, log.start, log.stamps) for log, driven in zip(logs, signals, strict=True)]
+    # J of Eq. (1): derivatives (Z, 3, n) of the ends by the matrix elements and the effects' parameters.
     columns = [OdometryBatch(true, model.integration).jacobian(model.matrix).reshape(len(logs), 3, -1)]
     plain = replace(model, fade=None)
     deviations = np.sqrt(np.maximum(np.diag(covariance)[model.matrix.size :], 0.0)).tolist()
@@ -142,7 +135,8 @@ def _slopes(model: OdometryModel, logs: Sequence[WheelLog], covariance: Array) -
             moved[number] = Term(term.effect, dict(term.values) | {name: term.values[name] + step})
             after = np.array([path[-1] for path in replace(plain, terms=tuple(moved)).poses(logs)]) if step else before
             columns.append(((after - before) / step if step else np.zeros_like(before))[..., None])
-    return np.concatenate(columns, axis=2)
+    slopes = np.concatenate(columns, axis=2)
+    return np.asarray(slopes @ covariance @ np.swapaxes(slopes, 1, 2))
 
 
 def slip_of(calibration: Calibration, runs: Sequence[Trajectory]) -> Slip | None:
@@ -204,22 +198,9 @@ def predicted_errors(calibration: Calibration, paths: Sequence[str] = ()) -> tup
     errors = []
     covariances = calibration_covariances(calibration, logs) + ends.of_slip(calibration.slip)
     for path, covariance, bias in zip(chosen, covariances, biases, strict=True):
-        models: tuple[tuple[Literal["calibration", "design"], Array], ...] = (
-            ("calibration", np.zeros(3)),
-            ("design", bias),
-        )
-        for model, off in models:
-            place, place_95, turn, turn_95 = error_region(covariance, off, runs)
-            errors.append(
-                PathError(
-                    path=path,
-                    model=model,
-                    position_m=place,
-                    position_95_m=place_95,
-                    heading_rad=turn,
-                    heading_95_rad=turn_95,
-                )
-            )
+        for model, off in (("calibration", np.zeros(3)), ("design", bias)):
+            sizes = dict(zip(_SIZES, error_region(covariance, off, runs), strict=True))
+            errors.append(PathError.model_validate({"path": path, "model": model} | sizes))
     return tuple(errors)
 
 

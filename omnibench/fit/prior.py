@@ -26,7 +26,6 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from omnibench.robot.kinematics import Array, Robot, RobotClass, class_of
 from omnibench.robot.physical import STEERING_ZERO, TRACKED_POINT, TRACKED_YAW, TURNING_CENTRE, PhysicalTolerance
@@ -46,11 +45,6 @@ def changes_by_centre(robot: Robot) -> Array:
     return np.array([[still, turning, still], [-turning, still, still]])
 
 
-def says_types(robot: Robot) -> bool:
-    """True if a wheel of the robot says its type, as files did not before wheels had types."""
-    return any(wheel.type is not None for wheel in robot.wheels)
-
-
 def default_cost(robot: Robot, runs: int) -> Literal["final_pose", "trajectory"]:
     """The cost where none is given: Eq. (6); the whole trajectory for robots whose wheels say their types, of few runs.
 
@@ -58,7 +52,8 @@ def default_cost(robot: Robot, runs: int) -> Literal["final_pose", "trajectory"]
     """
     rows = 3 if robot.slides or default_mount(robot) == "fit" else len(robot.motions)
     few = 3 * runs < _NUMBERS_EACH * rows * len(robot.drive.names)
-    return "trajectory" if few and says_types(robot) else "final_pose"
+    # Files did not say the types of wheels before omnibench knew others than omni.
+    return "trajectory" if few and any(wheel.type is not None for wheel in robot.wheels) else "final_pose"
 
 
 def default_mount(robot: Robot) -> MountChoice:
@@ -87,7 +82,12 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: Mount
     sliding to the side alone (a point ahead of the axle would slide), unless ``default_mount`` fits it.
     """
     design, scales = robot.inverse_kinematic_matrix, robot.row_scales
-    columns = _wheels_of_columns(robot)
+    # The wheel (M,) whose radius stretches each column; a car's mean, tangent and difference share one.
+    if robot.drive.direct:
+        columns = np.arange(design.shape[1])
+    else:
+        of_pairs = [wheel for wheel, pair in enumerate(robot.drive.pairs) for _ in range(1 if pair < 0 else 2)]
+        columns = np.array(of_pairs if len(of_pairs) == design.shape[1] else [0] * design.shape[1])
     roots = [design * np.isin(columns, wheel) * tolerance.radius for wheel in np.unique(columns)]
     roots += [design * np.eye(3)[:, [row]] * share for row, share in enumerate(tolerance.rows)]
     for row in np.flatnonzero(np.abs(design).sum(axis=1) > 0):
@@ -113,14 +113,3 @@ def physical_prior_root(robot: Robot, tolerance: PhysicalTolerance, mount: Mount
         x, y, still = design[0], design[1], np.zeros(design.shape[1])
         roots += [TRACKED_YAW * np.array([y, -x, still])]
     return np.array([root.ravel() for root in roots]).T
-
-
-def _wheels_of_columns(robot: Robot) -> NDArray[np.intp]:
-    """The wheel (M,) whose radius stretches each column; a car's columns share one."""
-    drive = robot.drive
-    if drive.direct:
-        return np.arange(len(drive.names), dtype=np.intp)
-    if len(drive.names) != sum(1 if pair < 0 else 2 for pair in drive.pairs):  # a car's mean, tangent and difference
-        return np.zeros(len(drive.names), dtype=np.intp)
-    wheels = [wheel for wheel, pair in enumerate(drive.pairs) for _ in range(1 if pair < 0 else 2)]
-    return np.array(wheels, dtype=np.intp)

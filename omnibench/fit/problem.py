@@ -122,7 +122,12 @@ class CalibrationProblem:
         self.odometry = cost.batch(self.trajectories, integration)
         # x, y and heading contiguous, the memory order in which the odometry returns poses.
         self.reference = _read_only(np.ascontiguousarray(cost.reference(self.trajectories).T)).T
-        bounds, start, relevant = parameterisation.bounds, parameterisation.start, self._relevant()
+        bounds, start, relevant = parameterisation.bounds, parameterisation.start, np.ones(1, dtype=bool)
+        if isinstance(parameterisation, MatrixElements):  # elements that the cost depends on: of headings, row 3's
+            relevant = np.repeat(parameterisation.rows.any(axis=0), len(robot.drive.names))
+            if 0.0 in cost.coordinates or isinstance(self.odometry, ReferenceBatch):
+                slopes = np.abs(self.odometry.jacobian(self.matrix(start))).max(axis=0).reshape(3, -1)
+                relevant = relevant & (np.abs(cost.coordinates) @ slopes > 0)
         self.box = bounds.name
         self.names, self.start = parameterisation.names, _read_only(start)
         self.lower = _read_only(np.where(relevant, bounds.lower, start))
@@ -246,8 +251,12 @@ class CalibrationProblem:
         candidates = candidates[: self.remaining]
         values, count = np.empty(len(candidates)), 0
         while count < len(candidates):
-            if not self._evaluator_tried and self._repays_building(len(candidates) - count):
-                self.build_evaluator()
+            if not self._evaluator_tried:
+                # The fast evaluator saves time with many candidates; of stored runs it must be built in the time left
+                coming, stored = self.evaluations + len(candidates) - count, isinstance(self.odometry, StoredOdometry)
+                least = _WORTH_BUILDING_OF_STORED if stored else _WORTH_BUILDING
+                if coming >= least and (not stored or (self.evaluations > 0 and self._part_size >= least)):
+                    self.build_evaluator()
             part = candidates[count : count + self._part_size]
             of_part = self._costs(part, self._evaluator)
             values[count : count + len(part)] = of_part
@@ -301,13 +310,6 @@ class CalibrationProblem:
         elements = self.matrix(vector).ravel()
         return elements if bool(self.inside(elements[None])[0]) else vector
 
-    def _repays_building(self, asked: int) -> bool:
-        """True if the fast evaluator saves time, with ``asked`` candidates more, and can be built in the time left."""
-        if not isinstance(self.odometry, StoredOdometry):
-            return self.evaluations + asked >= _WORTH_BUILDING
-        worth = _WORTH_BUILDING_OF_STORED
-        return self.evaluations > 0 and self.evaluations + asked >= worth and self._part_size >= worth
-
     @property
     def _part_size(self) -> int:
         """Candidates evaluated between two checks of the time: all, or of stored runs as many as there is time for."""
@@ -342,16 +344,6 @@ class CalibrationProblem:
         """Costs (P,) of poses (P, S, 3) at the cost's stamps; ``poses`` is overwritten."""
         poses -= self.reference
         return self.objective.combine(poses, self.odometry.trajectory)
-
-    def _relevant(self) -> NDArray[np.bool_]:
-        """True (n,) for elements that the cost depends on: for headings alone those of row 3."""
-        if not isinstance(self.parameterisation, MatrixElements):
-            return np.ones(len(self.parameterisation.start), dtype=bool)
-        used = np.repeat(self.parameterisation.rows.any(axis=0), len(self.robot.drive.names))
-        if 0.0 not in self.objective.coordinates and not isinstance(self.odometry, ReferenceBatch):
-            return used
-        slopes: Array = np.abs(self.odometry.jacobian(self.matrix(self.parameterisation.start))).max(axis=0)
-        return np.asarray(used & ((np.abs(self.objective.coordinates) @ slopes.reshape(3, -1)) > 0))
 
 
 def make_problem(

@@ -445,8 +445,7 @@ class _Ways:
     @property
     def _angles(self) -> Array:
         """Integrals (F, M) of the signals over each sample, rad."""
-        angles: Array = self._log.signals * np.diff(self._log.times, prepend=0.0)[:, None]
-        return angles
+        return self._log.signals * np.diff(self._log.times, prepend=0.0)[:, None]
 
     def lengths(self, matrices: Array) -> Array:
         """Distances (P, T) of matrices (P, 3, M), m."""
@@ -485,33 +484,30 @@ def with_mean_errors(errors: Array, matrix: Array, runs: Sequence[Trajectory], i
     for index, run in enumerate(runs):
         if not run.has_poses and run.references is not None:
             rows = reference_rows([run], "none")
-            errors[index] = _means(rows, ReferenceBatch(rows, integration).poses(matrix[None])[0] - rows.observed)
+            errors[index] = _means(rows, ReferenceBatch(rows, integration).poses(matrix[None])[0])
     return errors
 
 
 def mean_errors(model: OdometryModel, run: Trajectory) -> Array:
     """Mean error (3,) of a model at the lengths and places of a run (m), 0, and at its angles (rad); 0 of none."""
     rows = reference_rows([run], "none")
-    return _means(rows, predicted_by(model, rows) - rows.observed)
+    return _means(rows, predicted_by(model, rows))
 
 
-def _means(rows: ReferenceRows, errors: Array) -> Array:
-    placed, turned = rows.lengths != "", rows.angles != ""
-    lengths = np.linalg.norm(errors[placed, :2], axis=1)
-    return np.array(
-        [lengths.mean() if placed.any() else 0.0, 0.0, np.abs(errors[turned, 2]).mean() if turned.any() else 0.0]
-    )
+def _means(rows: ReferenceRows, predicted: Array) -> Array:
+    errors, placed, turned = predicted - rows.observed, rows.lengths != "", rows.angles != ""
+    length = np.linalg.norm(errors[placed, :2], axis=1).mean() if placed.any() else 0.0
+    return np.array([length, 0.0, np.abs(errors[turned, 2]).mean() if turned.any() else 0.0])
 
 
 def measured_parts(runs: Sequence[Trajectory]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """True (Z,) for runs of which a length or place was measured, and (Z,) for those of which an angle was."""
-    units = [
-        {"m", "rad"}
-        if run.has_poses or run.references is None
-        else {UNITS[kind] for kind in run.references.kinds.tolist()}
-        for run in runs
-    ]
-    return np.array(["m" in of_run for of_run in units]), np.array(["rad" in of_run for of_run in units])
+    every = ("position", "heading")  # of runs with poses
+    kinds = [every if run.has_poses or run.references is None else run.references.kinds.tolist() for run in runs]
+    placed, turned = (
+        np.array([any(UNITS[kind] == unit for kind in of_run) for of_run in kinds]) for unit in ("m", "rad")
+    )
+    return placed, turned
 
 
 def errors_by_kind(model: OdometryModel, runs: Sequence[Trajectory]) -> dict[ReferenceKind, Array]:

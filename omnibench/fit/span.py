@@ -112,9 +112,7 @@ def aligned(space: Array, robot: Robot) -> Array:
     They span the same space, except that a motion (along x, along y, on the spot) within a few degrees of the space
     counts as part of it.
     """
-    chosen = np.zeros((0, space.shape[1]))
-    motions = _motions(robot)
-    left = space
+    chosen, motions, left = np.zeros((0, space.shape[1])), _motions(robot), space
     while len(left):
         inside = motions @ left.T
         reach = np.linalg.norm(inside, axis=1)
@@ -190,10 +188,8 @@ def motion_in_words(direction: Array, robot: Robot) -> str:
     if np.linalg.norm(direction @ motions) < _NO_MOTION * np.linalg.norm(direction):
         return ""
     x, y, turn = robot.inverse_kinematic_matrix @ direction
-    reach = robot.reach
-    speed, spin = math.hypot(x, y), abs(turn) * reach
-    rolled = float(robot.radii.mean() * np.linalg.norm(direction))
-    if max(speed, spin) < _NO_MOTION * rolled:
+    speed, spin = math.hypot(x, y), abs(turn) * robot.reach
+    if max(speed, spin) < _NO_MOTION * float(robot.radii.mean() * np.linalg.norm(direction)):  # of the way they roll
         return ""
     if speed < _ALMOST * spin:
         return "turning on the spot"
@@ -209,12 +205,10 @@ def motion_in_words(direction: Array, robot: Robot) -> str:
 def _motions(robot: Robot) -> Array:
     """Signals (D, M) of length one that move the designed robot along x, along y where it can, and on the spot."""
     signals = robot.motions @ robot.signal_equations.T
-    motions: Array = signals / np.linalg.norm(signals, axis=1, keepdims=True)
-    return motions
+    return signals / np.linalg.norm(signals, axis=1, keepdims=True)
 
 
 def _signed(directions: Array) -> Array:
     """Directions (q, N) with their first large element positive, so that their names do not depend on the data."""
     leading = (np.abs(directions) > 0.5 * np.abs(directions).max(axis=1, keepdims=True)).argmax(axis=1)
-    signed: Array = directions * np.sign(directions[np.arange(len(directions)), leading])[:, None]
-    return signed
+    return directions * np.sign(directions[np.arange(len(directions)), leading])[:, None]

@@ -165,10 +165,8 @@ def in_start_frames(runs: Sequence[Trajectory], values: Sequence[Array]) -> list
 
     Repetitions of a command that start in different headings can be compared only so.
     """
-    turned = []
-    for run, of_run in zip(runs, values, strict=True):
-        turned.append(np.einsum("ij,kj...->ki...", rotation(-run.start[2]), of_run))
-    return turned
+    both = zip(runs, values, strict=True)
+    return [np.einsum("ij,kj...->ki...", rotation(-run.start[2]), of_run) for run, of_run in both]
 
 
 def usable_runs(trajectories: Sequence[Trajectory], split: str = "train") -> tuple[Trajectory, ...]:

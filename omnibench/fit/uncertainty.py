@@ -112,7 +112,8 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
         noise = noise_of_matrix(problem.trajectories, result.matrix, problem.integration, loss).noise
     slopes = problem.parameterisation.slopes(result.vector)
     of_elements = of_vector.of(slopes)
-    untold = depending(slopes, _not_moved(problem, result)) | elements_open(problem.parameterisation)
+    held = np.isin(problem.names, (*result.at_bounds, *result.held))  # the fit could not move these both ways
+    untold = depending(slopes, held) | elements_open(problem.parameterisation)
     reach = np.where(untold, np.nan, of_elements.reach).reshape(result.matrix.shape)
     return Uncertainty(
         covariance=of_elements.matrix,
@@ -127,18 +128,19 @@ def uncertainty_of(problem: CalibrationProblem, result: RunResult) -> Uncertaint
     )
 
 
-def _not_moved(problem: CalibrationProblem, result: RunResult) -> NDArray[np.bool_]:
-    """True (n,) for the numbers that the fit could not move both ways: on a bound of the box, or held."""
-    return np.asarray(np.isin(problem.names, (*result.at_bounds, *result.held)))
-
-
 def _by_scatter(problem: CalibrationProblem, result: RunResult, clusters: Clusters) -> EstimatedCovariance:
     """Jackknife covariance (n, n) of the vector of a minimum."""
     objective = problem.objective
     assert result.vector is not None  # uncertainty_of has checked
     if norms_of(objective) is None:
         raise NoCovarianceError(f"no covariance: the cost {objective.name} is no sum of norms")
-    if runs := runs_without_heading(problem):
+    # Positions of runs that do not tell their start heading count as they are. The heading is then fitted to noise,
+    # which makes lengths wrong by more than the runs scatter: with 8 of 28 runs turning on the spot 74 % of the 95 %
+    # intervals hold the truth, without them 97 %, 40 and 24 sets (tests/studies/reference_coverage.py --robots diff
+    # --kinds position --calibrator closed_form).
+    rows = problem.odometry.rows if isinstance(problem.odometry, ReferenceBatch) else None
+    if rows is not None and rows.tells_no_heading.any():
+        runs = sorted({rows.runs[index].id for index in rows.trajectory[rows.tells_no_heading].tolist()})
         shown = ", ".join(runs[:3]) + ", ..." * (len(runs) > 3)
         raise NoCovarianceError(
             f"no covariance: the positions of {plural(len(runs), 'run')} ({shown}) do not tell which way the robot "
@@ -164,19 +166,6 @@ def _by_scatter(problem: CalibrationProblem, result: RunResult, clusters: Cluste
     covariance, freedom = np.zeros((problem.size, problem.size)), np.ones(problem.size)
     covariance[np.ix_(free, free)], freedom[free] = answer.matrix, answer.degrees_of_freedom
     return EstimatedCovariance(covariance, freedom)
-
-
-def runs_without_heading(problem: CalibrationProblem) -> list[str]:
-    """Ids of the runs whose positions do not tell their start heading, which a cost counts as they are.
-
-    The heading is then fitted to noise, which makes lengths wrong by more than the runs scatter: with 8 of 28 runs
-    turning on the spot 74 % of the 95 % intervals hold the truth, without them 97 %, 40 and 24 sets
-    (tests/studies/reference_coverage.py --robots diff --kinds position --calibrator closed_form).
-    """
-    if not isinstance(problem.odometry, ReferenceBatch):
-        return []
-    rows = problem.odometry.rows
-    return sorted({rows.runs[index].id for index in rows.trajectory[rows.tells_no_heading].tolist()})
 
 
 def _of_runs(
@@ -279,7 +268,7 @@ def physical_parameters(
         covariance = np.array(result.extension.covariance)
         of_elements = np.broadcast_to(freedom, result.matrix.size)  # effects scatter at least as freely as these
         freedom = np.append(of_elements, np.full(len(covariance) - len(of_elements), of_elements.min()))
-    held = _not_moved(problem, result)
+    held = np.isin(problem.names, (*result.at_bounds, *result.held))
     unknown, weighed = [problem.parameterisation.slopes(result.vector)[:, held].T], bool(result.covariance_source)
     if not weighed:  # otherwise the design tells of them, too
         unknown.append(np.kron(np.eye(3), problem.unidentified))

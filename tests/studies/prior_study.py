@@ -23,7 +23,6 @@ from omnibench.compare.score import score_fits
 from omnibench.compare.statistics import make_cells
 from omnibench.fit import estimate, loss
 from omnibench.fit.calibrator import run_calibrator
-from omnibench.fit.calibrators import map as module
 from omnibench.registry import calibrators, load_plugins
 from omnibench.robot import physical as geometry
 from omnibench.robot.kinematics import class_of
@@ -37,13 +36,13 @@ TOLERANCES: dict[str, Callable[[geometry.PhysicalTolerance, float], geometry.Phy
 }
 CONSTANTS: dict[str, Callable[[float], tuple[Any, str, Any]]] = {  # what is set where, by a factor
     "stretches": lambda factor: (
-        module,
+        estimate,
         "EstimateProblem",
         partial(estimate.EstimateProblem, stretches=round(factor * estimate._STRETCHES)),
     ),
     "poses of a stretch": lambda factor: (estimate, "_POSES", round(factor * estimate._POSES)),
     "first deviation": lambda factor: (estimate, "_FIRST", factor * estimate._FIRST),
-    "least deviation": lambda factor: (estimate, "_LEAST", factor * estimate._LEAST),
+    "least deviation": lambda factor: (estimate, "LEAST", factor * estimate.LEAST),
     "Huber's corner": lambda factor: (loss, "CORNERS", {key: factor * value for key, value in loss.CORNERS.items()}),
 }
 

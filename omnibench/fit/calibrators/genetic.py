@@ -63,7 +63,15 @@ class Genetic(Calibrator):
             mothers, fathers, singles = np.split(parents, [crossed, 2 * crossed])
             children = np.where(rng.random(mothers.shape) < 0.5, mothers, fathers)
             feasible = options.mutation == "adaptive_feasible"
-            moved = _moved(singles, step, rng) if feasible else singles + step * rng.standard_normal(singles.shape)
+            directions = rng.standard_normal(singles.shape)
+            lengths: Array | float = step
+            if feasible:  # in a random direction, at most as far as the unit cube reaches
+                directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    room = np.where(directions > 0, (1 - singles) / directions, -singles / directions)
+                longest = np.nanmin(np.where(directions == 0, np.inf, room), axis=1, keepdims=True)
+                lengths = np.minimum(step, longest)
+            moved = singles + lengths * directions
             newcomers = np.concatenate([children, np.clip(moved, 0.0, 1.0)])
             survivors = np.argsort(scores, kind="stable")[:elite]
             people = np.concatenate([people[survivors], newcomers])
@@ -81,17 +89,6 @@ class Genetic(Calibrator):
                     reason = f"best changed by {options.tolerance:g} or less on average over "
                     return Solution(problem.best_vector, f"{reason}{options.stall_generations} generations")
         return Solution(problem.best_vector, f"{generations} generations", converged=False)
-
-
-def _moved(parents: Array, step: float, rng: np.random.Generator) -> Array:
-    """Points (P, f) after steps in random directions that stay in the unit cube, up to rounding."""
-    directions = rng.standard_normal(parents.shape)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(directions > 0, (1 - parents) / directions, -parents / directions)
-    longest = np.nanmin(np.where(directions == 0, np.inf, room), axis=1, keepdims=True)
-    moved: Array = parents + directions * np.minimum(step, longest)
-    return moved
 
 
 def _scores(problem: CalibrationProblem, points: Array) -> Array:

@@ -117,11 +117,15 @@ class _LinearErrors:
         moved = self._rows @ (self._slopes @ (vector - self._problem.start))
         return np.linalg.norm((moved - self._missing) * self._weights, axis=1)
 
+    def _system(self, weights: Array, slopes: Array) -> tuple[Array, Array]:
+        """Columns (3S, n) by slopes (3N, n) of the elements, and right side (3S,), of Eq. (2) with weights (S,)."""
+        factors = np.sqrt(weights)[:, None] * self._weights
+        missing = (factors * self._missing).ravel()
+        return (factors[..., None] * self._rows).reshape(len(missing), -1) @ slopes, missing
+
     def reweighted(self, weights: Array) -> Array:
         """The vector (n,) of the box that minimises Eq. (2), its terms times weights (S,)."""
-        factors = np.sqrt(self.shares * weights)[:, None] * self._weights
-        missing = (factors * self._missing).ravel()
-        columns = (factors[..., None] * self._rows).reshape(len(missing), -1) @ self._slopes
+        columns, missing = self._system(self.shares * weights, self._slopes)
         start = self._problem.start
         return start + bounded_step(self._problem, start, columns.T @ columns, -columns.T @ missing)
 
@@ -132,11 +136,9 @@ class _LinearErrors:
         from omnibench.fit.sum_of_norms import solve_program
 
         problem, unit = self._problem, self.unit
-        factors = np.sqrt(self.shares)[:, None] * self._weights
-        missing = (factors * self._missing).ravel()
+        columns, missing = self._system(self.shares, self._slopes * unit)
         step = cp.Variable(problem.size)
-        slopes = self._slopes * unit
-        errors = (factors[..., None] * self._rows).reshape(len(missing), -1) @ slopes @ step - missing
+        errors = columns @ step - missing
         scale = max(float(np.abs(missing).max()), np.finfo(float).tiny)
         within = [step >= (problem.lower - problem.start) / unit, step <= (problem.upper - problem.start) / unit]
         solve_program(cp.Problem(cp.Minimize(cp.sum_squares(errors / scale)), within))

@@ -16,16 +16,8 @@ from pydantic import Field, model_validator
 from omnibench.config import NonNegative, Positive
 from omnibench.data.stored import drawn_runs
 from omnibench.errors import DataError
+from omnibench.fit import estimate as estimates
 from omnibench.fit.calibrator import Calibrator, Solution
-from omnibench.fit.estimate import (
-    LOST_RATE,
-    USUAL_NUISANCES,
-    EstimateProblem,
-    Nuisances,
-    Unknown,
-    estimate,
-    estimate_with_steering,
-)
 from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.loss import loss_of
 from omnibench.fit.motion_windows import windows_of
@@ -52,12 +44,13 @@ class MapOptions(Options):
         description="standard deviation of the rate that turning wheels lose, rad/s; 0: none; default: the class's",
     )
     start_heading: NonNegative = Field(
-        USUAL_NUISANCES[0], description="standard deviation of the runs' start headings, rad; 0: they are exact"
+        estimates.USUAL_NUISANCES[0],
+        description="standard deviation of the runs' start headings, rad; 0: they are exact",
     )
     clock: Literal["none", "offset", "offset_and_slope"] = Field(
         "offset", description="of the reference, estimated for each run; none: it is exact"
     )
-    clock_offset: Positive = Field(USUAL_NUISANCES[1], description="its expected size, s")
+    clock_offset: Positive = Field(estimates.USUAL_NUISANCES[1], description="its expected size, s")
     clock_slope: Positive = Field(0.003, description="its expected size, s per s")
     steering: Literal["known", "fit"] = Field("known", description="fit: also its gain, play and coupling, or zero")
 
@@ -97,14 +90,14 @@ class Map(Calibrator):
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
 
-        of_runs = EstimateProblem(
+        of_runs = estimates.EstimateProblem(
             robot,
             runs,
             problem.parameterisation.projection @ physical_prior_root(robot, tolerance, mount),
             problem.integration,
             problem.sample_period,
-            (Unknown(*LOST_RATE, lost),) if lost else (),
-            Nuisances(options.start_heading, *clock),
+            (estimates.Unknown(*estimates.LOST_RATE, lost),) if lost else (),
+            estimates.Nuisances(options.start_heading, *clock),
             "huber" if loss == "squares" else loss,
         )
 
@@ -113,9 +106,9 @@ class Map(Calibrator):
             return problem.seconds_left > 0
 
         if options.steering == "fit":
-            found = estimate_with_steering(of_runs, may_go_on)
+            found = estimates.estimate_with_steering(of_runs, may_go_on)
         else:
-            found = estimate(of_runs, may_go_on)
+            found = estimates.estimate(of_runs, may_go_on)
         clusters = Clusters.of(runs)
         unit = np.eye(found.root.shape[1])
         covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
@@ -125,12 +118,12 @@ class Map(Calibrator):
             extension = ModelExtension(
                 effects=tuple(map(EffectTerm.of, found.terms)),
                 covariance=covariance_rows(covariance.matrix),
-                plain=matrix_rows(estimate(replace(of_runs, unknowns=()), may_go_on, found).matrix),
+                plain=matrix_rows(estimates.estimate(replace(of_runs, unknowns=()), may_go_on, found).matrix),
             )
         if len(runs) < len(problem.trajectories):
             end += f" with {len(runs):,} of {len(problem.trajectories):,} runs, which chance has drawn"
         if lost:
-            rate = float(found.terms[0].values[LOST_RATE[1]])
+            rate = float(found.terms[0].values[estimates.LOST_RATE[1]])
             end += f"; turning wheels {'gain' if rate > 0 else 'lose'} {abs(rate):.4f} rad/s"
         if not np.isfinite(problem.cost(found.matrix.reshape(1, -1))).all():
             raise DataError("the cost of its answer is not finite")
