@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -180,7 +180,7 @@ class SquaresMethod(TwoWheelMethod):
         """
         self.needs_matrix(problem)
         robot, ways = problem.robot, squares_both_ways(problem)
-        clockwise, counter = (float(np.mean([square.error[self.coordinate] for square in way])) for way in ways)
+        clockwise, counter = map(self.mean_error, ways)
         side = float(np.mean([square.side for way in ways for square in way]))
         wheelbase, diameters = self.factors(clockwise, counter, side, axle_length(robot))
         factors = {name: 2 / (1 + diameters ** float(np.sign(y))) for name, y in sides_of_axle(robot).items()}
@@ -194,6 +194,10 @@ class SquaresMethod(TwoWheelMethod):
             f"(E_d {diameters:.4f}), from {len(ways[0])} clockwise and {len(ways[1])} counter-clockwise squares of "
             f"{side:.2f} m",
         )
+
+    def mean_error(self, squares: Sequence[Square]) -> float:
+        """Mean error of squares that were driven one way."""
+        return float(np.mean([square.error[self.coordinate] for square in squares]))
 
     @abstractmethod
     def factors(self, clockwise: float, counter: float, side: float, axle: float) -> tuple[float, float]:
