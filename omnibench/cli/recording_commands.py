@@ -21,7 +21,6 @@ from omnibench.words import plural
 if TYPE_CHECKING:
     from omnibench.check.check import CheckReport
     from omnibench.design.candidates import DesignRequest
-    from omnibench.report.blocks import Document
     from omnibench.simulate.source import SimulationRequest
     from omnibench.slam.slam_dataset import SlamRequest
 
@@ -334,34 +333,24 @@ def simulate(
     page: shared.ReportOptions = shared.report_options("Write a page with figures of the recording and the truth."),
     force: bool = shared.FORCE,
     plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
 ) -> None:
     """Simulate recordings of a robot whose true model is known.
 
     The truth stays out of the data set: it is written to another folder with --truth, or else nowhere.
     """
+    from omnibench.report.recording.section import SimulatedResult
+
     page.refuse(force=force)
     shared.load_given_plugins([*(plugins or []), *request.plugins] or None)
     with ProgressDisplay() as watch:
         made = request.write(table_format, watch)
-
-        def document() -> "Document":
-            from omnibench.report.recording.section import recording_document
-
+        shown = made.simulation
+        known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
+        truth = None if request.truth is None else request.truth / "truth.yaml"
+        files = {"truth": truth, "report": page.report}
+        result = SimulatedResult(made.dataset, output, accuracy=made.accuracy, known=known, files=files)
+        if page.asked:
             watch(Progress("writing the report"))
-            shown = made.simulation
-            known: dict[str, Any] = {"truth": shown.paths, "plan": shown.plan, "starts": shown.starts} if shown else {}
-            return recording_document(made.dataset, accuracy=made.accuracy, **known)
-
-        page.write(document)
-    warn(made.dataset.warnings)
-    if made.accuracy is not None:
-        from omnibench.report.recording.section import error_table
-        from omnibench.report.terminal import print_table
-
-        print_table(make_console(), error_table(made.accuracy))
-    if request.truth is not None:
-        typer.echo(f"truth: {request.truth / 'truth.yaml'}")
-    if page.report is not None:
-        typer.echo(f"report: {page.report}")
-    typer.echo(f"{plural(len(made.dataset.trajectories), 'simulated trajectory')}: {output}")
-    print_ending(f"{output} is a data set like any other", "see what it tells", "omnibench", "inspect", output)
+        page.write(result.page)
+    show(result, as_json)

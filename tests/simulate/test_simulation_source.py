@@ -464,9 +464,12 @@ def test_latency_makes_the_reference_late() -> None:
 
 def test_the_command_writes_it_apart_from_the_data(command: Command, tmp_path: Path) -> None:
     file = file_of(tmp_path, repetitions=1, commands={"directions_deg": [0], "turn_rates": [0.0]})
-    printed = command("simulate", file, "-o", "data", "--truth", "truth")
+    printed = command("simulate", file, "-o", "data", "--truth", "truth", "--report", "page.html", "--json")
     assert printed.returncode == 0, printed.stderr
-    assert "1 simulated trajectory: data" in printed.stdout
+    told = json.loads(printed.stdout)
+    assert (told["dataset"], told["trajectories"]) == ("data", 1)
+    assert told["accuracy"] == json.loads(Path("truth/slam_accuracy.json").read_text())
+    assert "omnibench inspect data" in Path("page.html").read_text()
     paths = read_true_poses(tmp_path / "truth")
     assert list(paths) == ["train-001"]
     assert (tmp_path / "truth" / "slam_accuracy.json").is_file()

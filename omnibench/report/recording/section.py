@@ -160,6 +160,44 @@ class ReferencePosesResult(Result):
         return self.result.summary
 
 
+class SimulatedResult(Result):
+    """A simulated data set that was written, with the errors of its SLAM poses, if it has some.
+
+    known: of its truth, what ``recording_document`` takes. files: what else was written, by what it is.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        place: Path,
+        *,
+        accuracy: SlamAccuracy | None,
+        known: Mapping[str, Any],
+        files: Mapping[str, Path | None],
+    ) -> None:
+        self.dataset, self.place, self.accuracy, self.known, self.files = dataset, place, accuracy, known, files
+        self.warnings = dataset.warnings
+
+    def tables(self) -> Sequence[blocks.Table]:
+        return [] if self.accuracy is None else [error_table(self.accuracy)]
+
+    def remarks(self) -> Sequence[Remark]:
+        written = {**self.files, plural(len(self.dataset.trajectories), "simulated trajectory"): self.place}
+        return [Remark(f"{what}: {file}") for what, file in written.items() if file is not None]
+
+    def next_step(self) -> NextStep:
+        what = f"{self.place} is a data set like any other"
+        return NextStep(what, "see what it tells", ("omnibench", "inspect", self.place))
+
+    def document(self) -> blocks.Document:
+        return recording_document(self.dataset, accuracy=self.accuracy, **self.known)
+
+    def json(self) -> Mapping[str, Any]:
+        accuracy = None if self.accuracy is None else self.accuracy.model_dump()
+        runs = len(self.dataset.trajectories)
+        return {"dataset": str(self.place), "trajectories": runs, "accuracy": accuracy, "warnings": list(self.warnings)}
+
+
 def field_table(caption: str, columns: Mapping[str, Mapping[str, float | None]], note: str = "") -> blocks.Table:
     """Numbers by the names of their fields, whose endings give the unit: a row a field, a column each."""
     rows = []
