@@ -74,6 +74,11 @@ def segment_ends(run: Trajectory, design: Array, length: float) -> NDArray[np.in
     return np.array(ends if ends and ends[-1] == last else [*ends, last])
 
 
+def has_two_wheels(robot: Robot) -> bool:
+    """True for a differential drive with two measured wheels."""
+    return class_of(robot) == "differential" and len(robot.measured) == 2
+
+
 class TwoWheelMethod(ArticleMethod):
     """An article's method for a differential drive with two measured wheels."""
 
@@ -81,7 +86,7 @@ class TwoWheelMethod(ArticleMethod):
 
     def applies(self, robot: Robot) -> bool:
         """True for a differential drive with two measured wheels."""
-        return class_of(robot) == "differential" and len(robot.measured) == 2
+        return has_two_wheels(robot)
 
 
 def middle_of_axle(robot: Robot) -> Array:
@@ -134,8 +139,40 @@ class Square:
     error: Array
 
 
-def squares_both_ways(problem: CalibrationProblem) -> tuple[list[Square], list[Square]]:
-    """The closed squares among the training runs, clockwise and counter-clockwise, by the odometry of the design.
+@dataclass(frozen=True)
+class SquaresBothWays:
+    """Squares that were driven clockwise and counter-clockwise; at least one each."""
+
+    clockwise: tuple[Square, ...]
+    counter: tuple[Square, ...]
+
+    @property
+    def side(self) -> float:
+        """Mean side, m."""
+        return float(np.mean([square.side for square in (*self.clockwise, *self.counter)]))
+
+    def solution(self, robot: Robot, wheelbase: float, diameters: float) -> Solution:
+        """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left.
+
+        With the mean D of the diameters, D_right = 2 D / (1 + 1/E_d) and D_left = 2 D / (1 + E_d) (Borenstein and Feng,
+        IEEE T-RA 12:869, 1996); where the design's differ, each is multiplied.
+        """
+        sides = sides_of_axle(robot)
+        factors = {name: 2 / (1 + diameters ** float(np.sign(side))) for name, side in sides.items()}
+        corrected = with_axle(robot, factors, wheelbase)
+        sides = sides_of_axle(corrected)
+        wheels = sorted(corrected.measured, key=lambda wheel: -sides[wheel.name])
+        left, right = (f"{wheel.name} {1000 * wheel.radius:.3f}" for wheel in wheels)
+        return Solution(
+            corrected.inverse_kinematic_matrix.ravel(),
+            f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
+            f"(E_d {diameters:.4f}), from {len(self.clockwise)} clockwise and {len(self.counter)} counter-clockwise "
+            f"squares of {self.side:.2f} m",
+        )
+
+
+def squares_both_ways(problem: CalibrationProblem) -> SquaresBothWays:
+    """The closed squares among the training runs, by the odometry of the design.
 
     NotApplicableError: there are none, or they were driven one way only.
     """
@@ -154,12 +191,13 @@ def squares_both_ways(problem: CalibrationProblem) -> tuple[list[Square], list[S
         if np.hypot(*off.T).max() <= _OFF_CORNER * side and abs(abs(odometry[-1, 2]) - 2 * math.pi) <= _OFF_TURN:
             truth = poses_of_axle(robot, run.poses[[0, -1]])
             squares.append(Square(side, way, relative(truth[0], truth[1]) - odometry[-1]))
-    clockwise, counter = ([square for square in squares if square.way == way] for way in (-1, 1))
+    clockwise = tuple(square for square in squares if square.way < 0)
+    counter = tuple(square for square in squares if square.way > 0)
     if not clockwise or not counter:
         count = f"{plural(len(squares), 'square')} among {plural(len(problem.trajectories), 'run')}"
         which = f"{count}, none clockwise" if counter else f"{count}, none counter-clockwise" if clockwise else "none"
         raise NotApplicableError(f"it is for closed squares driven both ways from a corner (found: {which})")
-    return clockwise, counter
+    return SquaresBothWays(clockwise, counter)
 
 
 class SquaresMethod(TwoWheelMethod):
@@ -172,28 +210,12 @@ class SquaresMethod(TwoWheelMethod):
     coordinate: ClassVar[int]
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
-        """The robot with the wheelbase times a factor E_b and the wheels' diameters in a ratio E_d, right to left.
-
-        With the mean D of the diameters, D_right = 2 D / (1 + 1/E_d) and D_left = 2 D / (1 + E_d) (Borenstein and Feng,
-        IEEE T-RA 12:869, 1996); where the design's differ, each is multiplied. NotApplicableError: there are no
-        squares, or they were driven one way only.
-        """
+        """Apply the article's formulas. NotApplicableError: there are no squares, or they were driven one way only."""
         self.needs_matrix(problem)
-        robot, ways = problem.robot, squares_both_ways(problem)
-        clockwise, counter = map(self.mean_error, ways)
-        side = float(np.mean([square.side for way in ways for square in way]))
-        wheelbase, diameters = self.factors(clockwise, counter, side, axle_length(robot))
-        factors = {name: 2 / (1 + diameters ** float(np.sign(y))) for name, y in sides_of_axle(robot).items()}
-        corrected = with_axle(robot, factors, wheelbase)
-        sides = sides_of_axle(corrected)
-        wheels = sorted(corrected.measured, key=lambda wheel: -sides[wheel.name])
-        left, right = (f"{wheel.name} {1000 * wheel.radius:.3f}" for wheel in wheels)
-        return Solution(
-            corrected.inverse_kinematic_matrix.ravel(),
-            f"wheelbase {1000 * axle_length(corrected):.1f} mm (E_b {wheelbase:.4f}), radii {left} and {right} mm "
-            f"(E_d {diameters:.4f}), from {len(ways[0])} clockwise and {len(ways[1])} counter-clockwise squares of "
-            f"{side:.2f} m",
-        )
+        squares = squares_both_ways(problem)
+        clockwise, counter = self.mean_error(squares.clockwise), self.mean_error(squares.counter)
+        factors = self.factors(clockwise, counter, squares.side, axle_length(problem.robot))
+        return squares.solution(problem.robot, *factors)
 
     def mean_error(self, squares: Sequence[Square]) -> float:
         """Mean error of squares that were driven one way."""
