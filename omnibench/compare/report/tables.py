@@ -358,14 +358,15 @@ def data_table(robots: Sequence[ComparedRobot], broken: Mapping[str, str]) -> Ta
                 count(len(sessions)) if sessions else "not known",
                 listing([training.name for training in robot.trainings], 20),
                 Cell(dataset.source, dataset.licence),
-                Cell(dataset.description or dataset.name, f"SHA-256 {dataset.hash[:16]}"),
+                dataset.hash[:8],
             )
         )
     for name, reason in broken.items():
         rows.append(Row.of(name, *[""] * 4, Cell("cannot be read", reason), "", "", role="failed"))
     numbers = map(Column, ("Runs", "Duration of a run", "Commands", "Sessions"))
-    words = [Column(title, numeric=False) for title in ("Trainings", "Source", "Description")]
-    return Table("Recordings", (Column("Name", numeric=False), *numbers, *words), tuple(rows))
+    words = [Column(title, numeric=False) for title in ("Trainings", "Source", "SHA-256")]
+    described = [f"{robot.name}: {robot.dataset.description}" for robot in robots if robot.dataset.description]
+    return Table("Recordings", (Column("Name", numeric=False), *numbers, *words), tuple(rows), " ".join(described))
 
 
 def matrix_blocks(view: views.DatasetView) -> Iterator[Block]:
