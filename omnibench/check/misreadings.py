@@ -267,8 +267,8 @@ def _search_sparse(recording: Recorded) -> Explained:
     if not present > _LEAST_MISFIT:  # nan: it hardly moved
         contradicting = _contradicting(recording)
         return moments.off_centre() if positions and not contradicting else Explained(contradicting)
-    # Mistakes of the wheels, one of them or none, each with every unit of the positions. Factors of rates and radii
-    # that a calibration is for are left out: sparse poses do not tell them from another design.
+    # Mistakes of the wheels, one of them or none, each with every unit of the positions. Small factors of rates and
+    # radii are left to the calibration: sparse poses do not tell them from another design.
     wheels = []
     for wheel in readings.wheel_hypotheses(robot, counted=recording.counted):
         scaled, factors = any(mistake.kind in _SCALES for mistake in wheel.mistakes), np.diag(wheel.columns)

@@ -82,8 +82,8 @@ def compare(
     )
     chosen = _with_added(chosen, added or ())
     with ProgressDisplay() as watch:
-        kept = user_cache_path("omnibench") / "fits" if added else None
-        result = omnibench.run_comparison(chosen, output, watch, force=force, cache=kept)
+        fits = user_cache_path("omnibench") / "fits" if added else None
+        result = omnibench.run_comparison(chosen, output, watch, force=force, cache=fits)
         view = ComparisonView(result, everything=everything)
         if traces is not None:
             files = [file for each in views(result) for file in write_traces(each, traces / each.name)]

@@ -277,7 +277,7 @@ class CompareConfig(Model):
 
     @property
     def entries(self) -> tuple[CalibratorEntry, ...]:
-        """What is compared, under either name."""
+        """The entries that are compared, of ``calibrators`` or ``methods``."""
         return (*self.calibrators, *self.methods)
 
     @property
@@ -477,7 +477,7 @@ def suitable_calibrators(dataset: Dataset) -> list[str]:
 
 
 def config_in_words(config: CompareConfig) -> str:
-    """What such a comparison runs, in a sentence."""
+    """The calibrators, cost and budget of a comparison without a config, in a sentence."""
     names = ", ".join(entry.name for entry in config.entries)
     return (
         f"no config is given: {names}; cost {config.objective}, at most {config.budget.evaluations:,} evaluations and "

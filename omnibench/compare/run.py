@@ -82,8 +82,8 @@ def resumable(plan: Sequence[PlannedFit], store: ResultStore[RunResult], folder:
         yield
     except (KeyboardInterrupt, BackendError) as error:
         asked = [fit for fit in plan if not fit.refusal]
-        kept = sum(store.get(fit.key) is not None for fit in asked)
-        way = f"{kept} of {len(asked)} runs are kept in {folder}: run again with -o {folder}"
+        stored = sum(store.get(fit.key) is not None for fit in asked)
+        way = f"{stored} of {len(asked)} runs are kept in {folder}: run again with -o {folder}"
         if isinstance(error, BackendError):
             raise type(error)(f"{error}; {way}") from None
         raise Interrupted(f"interrupted; {way}") from None
@@ -145,8 +145,8 @@ class _Runs(JobWatch[RunResult]):
         result = self._result(number, ending) if isinstance(ending, Failure) else ending
         self.results[number] = result
         cost = "no answer" if result.cost is None else f"cost {result.cost:.6f}"
-        kept = ", kept from an earlier run" if reused else ""
-        figures = f"{cost}, {plural(result.evaluations, 'evaluation')}, {result.seconds:.1f} s{kept}"
+        origin = ", kept from an earlier run" if reused else ""
+        figures = f"{cost}, {plural(result.evaluations, 'evaluation')}, {result.seconds:.1f} s{origin}"
         words = f"{self._plan[number].title}: {result.outcome}, {figures} ({result.reason})"
         line = f"[{len(self.results)}/{len(self._plan)}] {words}"
         self._report_run(number, result.evaluations, result.cost, line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -35,12 +36,12 @@ class LibrarySearch(Calibrator):
 
     package: ClassVar[str]
 
+    @abstractmethod
     def search(self, cost: UnitCost, start: Array, rng: np.random.Generator) -> str:
         """Search from a start (f,) for points of low cost; the reason why the search ended by itself.
 
         rng: where all random numbers come from; libraries that take a seed get one drawn from it.
         """
-        raise NotImplementedError
 
     def calibrate(self, problem: CalibrationProblem) -> Solution:
         """The best candidate that the search evaluated. PluginError: the package is not installed."""

@@ -225,12 +225,10 @@ class Section:
     folded: bool = False
 
 
-def answer_section(
-    sentence: str, tiles: Sequence[Fact], picture: FigureGrid | None, *more: Block, title: str = "Answer"
-) -> Section:
-    """The section that a report begins with: the answer in a sentence, a few numbers, one picture, then the rest."""
-    pictures: tuple[Block, ...] = () if picture is None else (picture,)
-    return Section("answer", title, (Paragraph(sentence, "lead"), Facts(tuple(tiles), "tiles"), *pictures, *more))
+def answer_section(sentence: str, tiles: Sequence[Fact], *more: Block | None, title: str = "Answer") -> Section:
+    """The section that a report begins with: the answer in a sentence, a few numbers, a picture, then the rest."""
+    shown = (block for block in more if block is not None)
+    return Section("answer", title, (Paragraph(sentence, "lead"), Facts(tuple(tiles), "tiles"), *shown))
 
 
 @dataclass(frozen=True, eq=False)

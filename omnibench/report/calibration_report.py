@@ -58,7 +58,6 @@ class CalibrationResult(Result):
         again: Sequence[str] = (),
         box: object = None,
     ) -> None:
-        self.box = "" if box is None else f" {box!r}"
         self.run = shown if isinstance(shown, CalibrationRun) else None
         self.calibration = shown.calibration if isinstance(shown, CalibrationRun) else shown
         self.dataset, self.file, self.sources, self.again = dataset, file, sources, again
@@ -71,18 +70,15 @@ class CalibrationResult(Result):
         fitted = "" if origin is None else f", fitted to {origin.dataset} by {origin.calibrator}"
         self.heading = f"{name}{' (simulated data)' if origin is not None and origin.simulated else ''}"
         self.title = f"{type(shown).__name__} {name!r} of robot {robot}{fitted}"
-
-    @property
-    def warnings(self) -> list[str]:  # type: ignore[override]
-        """What the data and the search leave open."""
-        if self.run is None:
-            return []
-        found = [*(self.dataset.warnings if self.dataset else ()), *self.run.warnings]
-        if bounds := ", ".join(self.run.result.at_bounds):
-            found.append(f"on a bound of the box{self.box}: {bounds}; a wider box may fit better")
-        if untouched := ", ".join(self.run.untouched):
-            found.append(f"not fitted, kept at the start value by the box{self.box} or the cost: {untouched}")
-        return found
+        # What the data and the search leave open
+        warnings, in_box = list[str](), "box" if box is None else f"box {box!r}"
+        if self.run is not None:
+            warnings += [*(dataset.warnings if dataset else ()), *self.run.warnings]
+            if bounds := ", ".join(self.run.result.at_bounds):
+                warnings.append(f"on a bound of the {in_box}: {bounds}; a wider box may fit better")
+            if untouched := ", ".join(self.run.untouched):
+                warnings.append(f"not fitted, kept at the start value by the {in_box} or the cost: {untouched}")
+        self.warnings = warnings
 
     def sentence(self) -> str:
         return "" if self.verdict is None else self.verdict.sentence
@@ -399,9 +395,8 @@ def calibration_document(
             page.answer_section(
                 typeset(f"{verdict.sentence[:1].upper()}{verdict.sentence[1:]}."),
                 tiles,
-                None,
-                *([page.Callout("Sessions", tuple(map(typeset, sessions)), "warning")] if sessions else []),
-                *filter(None, [paths_before_after(runs, models, which)]),
+                page.Callout("Sessions", tuple(map(typeset, sessions)), "warning") if sessions else None,
+                paths_before_after(runs, models, which),
                 page.Callout("What these data leave open", tuple(map(typeset, warnings)), "warning"),
             ),
             *sections,

@@ -757,7 +757,8 @@ def test_a_comparison_on_dask_is_equal_to_the_bit_and_goes_on_with_another_backe
 @pytest.mark.slow
 class TestFits:
     @pytest.fixture(scope="class")
-    def dask(self) -> Iterator[Backend]:
+    @classmethod
+    def dask(cls) -> Iterator[Backend]:
         with open_backend(BackendChoice(name="dask", workers=2)) as backend:
             yield backend
 

@@ -75,9 +75,8 @@ class PlayedResult(Result):
         report, sent = self.report, sum(self.report.sent.values())
         delivered = "delivery not confirmed, since no omnibench node runs the robot"
         if report.taken is not None:
-            count = "all" if report.taken == sent else f"{report.taken:,} of {sent:,}"
             again = f", which started again {plural(report.restarts, 'time')} on the way" if report.restarts else ""
-            delivered = f"{count} taken by the node{again}"
+            delivered = f"{self._share} taken by the node{again}"
         messages = f"{plural(report.sent['joint_states'], 'wheel sample')} and "
         messages += plural(report.sent["slam_pose"], "SLAM pose")
         kind, seconds = "simulated" if self.simulated else "recorded", f"{report.data_seconds:.1f} s of the drive"
@@ -88,15 +87,22 @@ class PlayedResult(Result):
             lines.append(f"meanwhile the node counted {anomalies_in_words(report.anomalies)}")
         return list(map(Remark, lines))
 
+    @property
+    def _share(self) -> str:
+        """The messages that a node acknowledged: all, or so many of those sent."""
+        report = self.report
+        return "all" if report.acknowledged else f"{report.taken or 0:,} of {sum(report.sent.values()):,}"
+
     def next_step(self) -> NextStep:
-        taken = self.report.taken is not None
-        heard = "all was taken by the node" if taken else "no omnibench node said that it took anything"
+        heard = "no omnibench node said that it took anything"
+        if self.report.taken is not None:
+            heard = f"{self._share} was taken by the node"
         command = ("omnibench", "listen", self.robot)
         return NextStep(f"the recording was played, and {heard}", "listen while it plays", command)
 
 
 class DemonstrationResult(Result):
-    """What was played to a node, its errors against the reference, and its agreement with the batch odometry.
+    """A recording as it was played to a node: its errors, and their agreement with the batch odometry.
 
     file: the node's config.
     """
@@ -111,7 +117,7 @@ class DemonstrationResult(Result):
     def _judged(self) -> bool:
         """False after a signal: what the node would have made of the rest is not known."""
         report = self.shown.report
-        return report.taken == sum(report.sent.values()) and bool(report.sent["joint_states"])
+        return report.acknowledged and bool(report.sent["joint_states"])
 
     def tables(self) -> Sequence[Table]:
         shown, rows = self.shown, []

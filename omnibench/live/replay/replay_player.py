@@ -325,6 +325,11 @@ class PlayReport:
         return sum(self.sent.values()) == self.total
 
     @property
+    def acknowledged(self) -> bool:
+        """True if a node acknowledged every message that was sent."""
+        return self.taken == sum(self.sent.values())
+
+    @property
     def rate(self) -> float:
         """Messages sent per second."""
         return sum(self.sent.values()) / max(self.wall_seconds, 1e-9)

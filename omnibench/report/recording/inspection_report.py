@@ -42,9 +42,9 @@ class InspectionResult(Result):
         if missing := [each.motion for each in directions if each.state != "driven" and each.motion]:
             what = f"{named} hardly tells {' or '.join(missing)}"
             return NextStep(what, "read what to drive", ("omnibench", "guide", "driving"))
-        told = f"{named} determines {'most' if self.inspection.identifiability.sentences else 'all'} of the matrix"
+        share = "most" if self.inspection.identifiability.sentences else "all"
         command = ("omnibench", "calibrate", *self.sources, "-o", "calibration.yaml")
-        return NextStep(told, "calibrate it", command)
+        return NextStep(f"{named} determines {share} of the matrix", "calibrate it", command)
 
     def tables(self) -> Sequence[page.Table]:
         tables = [self._splits, identifiability_table(self.inspection)]

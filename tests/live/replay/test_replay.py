@@ -27,6 +27,7 @@ from replayed import DRIVE, ORIGIN, TOPICS, arrivals, config, of, played, same, 
 from sessions import Loopback, free_port, raw_session, until
 from timing import PATIENCE, load
 
+from omnibench.cli.terminal.live_tables import PlayedResult
 from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError
@@ -615,6 +616,14 @@ def test_a_node_that_stays_away_is_one_line_with_the_number_that_is_missing(node
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("taken", "share"), [(100, "all"), (90, "90 of 100"), (0, "0 of 100")])
+def test_what_a_node_took_is_told_alike_below_the_numbers_and_at_the_end(taken: int, share: str) -> None:
+    report = PlayReport({"joint_states": 95, "slam_pose": 5}, 100, taken, 0, 2.0, 2.0, 0.0, False, Counter())
+    shown = PlayedResult(report, simulated=False, robot="apr")
+    assert f"; {share} taken by the node" in shown.remarks()[0].text
+    assert shown.next_step().outcome == f"the recording was played, and {share} was taken by the node"
+
+
 class TestTheCommand:
     @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
     def test_without_its_node_it_exits_with_1(self, node: Command, folder: Path, port: int, number: int) -> None:
