@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-from browser import chromium
+from browser import chromium, opened
 from hypothesis import given
 from hypothesis import strategies as st
 from plotly.offline import get_plotlyjs
@@ -368,6 +368,23 @@ def test_every_figure_is_written_as_svg_and_png_with_titles_and_legend(tmp_path:
     assert picture.count('class="main-svg"') >= 2
     assert "a &lt; b &amp; c" in picture
     assert (tmp_path / "figures" / "wheels-more.png").read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.slow
+def test_a_browser_sets_notes_smaller_than_text_and_both_smaller_than_titles_on_paper_too(tmp_path: Path) -> None:
+    texts = (blocks.Paragraph("text"), blocks.Paragraph("note", "note"))
+    html = render(Document("A report", "", (Section("a", "Answer", texts),)))
+    measure = """<script>
+    const size = (selector) => parseFloat(getComputedStyle(document.querySelector(selector)).fontSize);
+    document.body.dataset.sizes = ["p.note", "p.plain", "h2", "h1"].map(size).join(" ");</script>"""
+    for name, page in (("screen", html), ("paper", html.replace("@media print", "@media all"))):
+        file = tmp_path / f"{name}.html"
+        file.write_text(page.replace("</body>", f"{measure}</body>"), encoding="utf-8")
+        drawn, _ = opened(file)
+        found = re.search(r'data-sizes="([^"]*)"', drawn)
+        assert found, drawn[-500:]
+        sizes = [float(each) for each in found.group(1).split()]
+        assert sizes == sorted(set(sizes)), name
 
 
 @pytest.mark.slow
