@@ -248,7 +248,6 @@ _Twist, _TwistCovariance = _ros("geometry_msgs/msg/Twist"), _ros("geometry_msgs/
 _Transform, _TransformStamped = _ros("geometry_msgs/msg/Transform"), _ros("geometry_msgs/msg/TransformStamped")
 _Status, _KeyValue = _ros("diagnostic_msgs/msg/DiagnosticStatus"), _ros("diagnostic_msgs/msg/KeyValue")
 _NOTHING = np.zeros(0)
-_STILL = _Vector(0.0, 0.0, 0.0)
 
 
 def _header(stamp: int, frame: str) -> Any:
