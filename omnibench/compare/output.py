@@ -330,8 +330,8 @@ def _statistics_row(entry: EntryStatistics) -> dict[str, Any]:
     for name in (item.name for item in fields(entry)):
         if name == "costs":
             for split in SPLITS:
-                row[split] = _interval_cell(entry.costs.get(split))
-                row[f"{split}_improvement"] = _interval_cell(entry.improvements.get(split))
+                row[split] = _interval_cell(entry.cost(split))
+                row[f"{split}_improvement"] = _interval_cell(entry.improvement(split))
         elif name not in ("typical", "improvements"):
             value = getattr(entry, name)
             row[name] = _interval_cell(value) if isinstance(value, Interval) else value

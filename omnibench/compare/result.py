@@ -171,6 +171,14 @@ class EntryStatistics:
     seconds_median: float | None
     reference_evaluations_median: float | None
 
+    def cost(self, split: Split) -> Interval | None:
+        """The typical run's mean cost on a split; None without an answer, or without such runs."""
+        return self.costs.get(split)
+
+    def improvement(self, split: Split) -> Interval | None:
+        """The share of the design values' cost that is gone on a split; None where it is not known."""
+        return self.improvements.get(split)
+
 
 @dataclass(frozen=True)
 class EntryVerdict:

@@ -189,7 +189,7 @@ def test_a_terminal_without_a_letter_shows_another(prepared: Prepared, tmp_path:
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert run.returncode == 0
     assert "Traceback" not in run.stderr
-    assert run.stdout.startswith("Gr??e: simulated data")
+    assert run.stdout.startswith("Gr??e, robot APR-02: simulated data")
 
 
 def test_list_names_everything_that_a_config_can_name(command: Command) -> None:

@@ -68,7 +68,7 @@ def answer_sentence(view: views.DatasetView) -> str:
         if view.without_poses:
             words = f"On the {runs}, {best.label} misses the references by {after}, where the design values miss them "
             words += f"by {before}"
-    if (improvement := best.improvements.get(view.scored)) is not None:
+    if (improvement := best.improvement(view.scored)) is not None:
         fell, sure = views.improvement_cells(improvement, 1)
         words += f": the cost fell by {fell}{'' if improvement.known is None else f' (95 % interval {sure})'}"
         words += ", which the noise alone could explain" if improvement.known and improvement.holds(0.0) else ""

@@ -40,12 +40,12 @@ def cost_table(view: views.DatasetView, split: Split, *, brief: bool = False) ->
     asked.sort(key=lambda entry: entry.costs[split].value if split in entry.costs else math.inf)
     lines: list[tuple[EntryStatistics | None, Interval | None, Array | None]] = []
     lines.append((design, view.design_costs.get(split), view.design_errors[split]))
-    lines += [(entry, entry.costs.get(split), view.errors(entry, split)) for entry in asked]
+    lines += [(entry, entry.cost(split), view.errors(entry, split)) for entry in asked]
     means = [np.nan if of is None else views.mean_and_worst(positions_and_headings(of)[0])[0] for *_, of in lines]
     factor, unit, digits = views.position_unit(*means)
     rows, decimals = [], view.cost_decimals
     for entry, cost, errors in lines:
-        improvement = None if entry is design or entry is None else entry.improvements.get(split)
+        improvement = None if entry is design or entry is None else entry.improvement(split)
         positions, headings = (np.array([]),) * 2 if errors is None else positions_and_headings(errors)
         position, worst = (fixed(factor * value, digits) for value in views.mean_and_worst(positions))
         heading, most = (fixed(np.degrees(value), 2) for value in views.mean_and_worst(headings))

@@ -124,7 +124,7 @@ class DatasetView:
 
         The design values are none, where the best one's improvement on them is more than chance.
         """
-        gained = None if self.best is None else self.best.improvements.get(self.scored)
+        gained = None if self.best is None else self.best.improvement(self.scored)
         better = gained is not None and gained.known is not None and not gained.holds(0.0)
         return [
             entry
