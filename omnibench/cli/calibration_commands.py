@@ -81,12 +81,14 @@ def compare(
         update={"plugins": folders} | {name: value for name, value in given.items() if value is not None}
     )
     chosen = _with_added(chosen, added or ())
+    if traces is not None and chosen.robots:
+        raise ConfigError("--traces is for a comparison on data sets, and this config names robots; leave it out")
     with ProgressDisplay() as watch:
         fits = user_cache_path("omnibench") / "fits" if added else None
         result = omnibench.run_comparison(chosen, output, watch, force=force, cache=fits)
         view = ComparisonView(result, everything=everything)
         if traces is not None:
-            files = [file for each in views(result) for file in write_traces(each, traces / each.name)]
+            files = write_traces(views(result), traces)
             typer.echo(f"traces: {traces} ({len(files)} searches)", err=True)
         if figures is not None:
             watch(Progress("drawing the figures"))

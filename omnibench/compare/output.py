@@ -108,16 +108,21 @@ def _fitted(result: ComparisonResult) -> dict[tuple[str, str], ScoredFit]:
 
 
 def _calibration_files(folder: Path, entries: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Path]:
-    """The calibration files of entries, which are given by data set and label; names differ by more than case."""
-    written: set[str] = set()
-    files = {}
-    for dataset, label in entries:
-        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", f"{dataset}-{label}").strip("_")
+    """The calibration files of entries, which are given by data set and label."""
+    known = list(entries)
+    names = file_names(f"{dataset}-{label}" for dataset, label in known)
+    return {entry: folder / "calibrations" / f"{name}.yaml" for entry, name in zip(known, names, strict=True)}
+
+
+def file_names(texts: Iterable[str]) -> list[str]:
+    """Names for files or folders of some texts, in their order; they differ by more than case."""
+    chosen: list[str] = []
+    for text in texts:
+        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("_.") or "entry"
         names = chain([plain], (f"{plain}-{number}" for number in count(2)))
-        name = next(each for each in names if each.lower() not in written)
-        written.add(name.lower())
-        files[dataset, label] = folder / "calibrations" / f"{name}.yaml"
-    return files
+        taken = {name.lower() for name in chosen}
+        chosen.append(next(name for name in names if name.lower() not in taken))
+    return chosen
 
 
 def summary(result: ComparisonResult) -> dict[str, Any]:

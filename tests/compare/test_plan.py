@@ -488,3 +488,8 @@ def test_the_courses_of_searches_are_written_as_iohinspector_reads_them(command:
     first, *rows = (file.parent / scenario["path"]).read_text().splitlines()
     assert first == "evaluations raw_y"
     assert float(rows[-1].split()[1]) == pytest.approx(searched["train_cost"], rel=1e-12)
+    there = command("compare", tmp_path / "small.yaml", "-o", tmp_path / "out", "--traces", tmp_path / "small.yaml")
+    assert there.returncode == 2
+    assert "Traceback" not in there.stderr
+    assert "small.yaml" in there.stderr.splitlines()[-1]
+    assert_refused(command("compare", CONFIGS / "real_robots.yaml", "--data", tmp_path, "--traces", "t"), "--traces")

@@ -19,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
+from omnibench.compare.output import file_names
 from omnibench.compare.plan import UNBOUNDED
 from omnibench.compare.report.charts import share_chart
 from omnibench.compare.report.view import DatasetView
 from omnibench.compare.result import ScoredFit
+from omnibench.files import write_text
 from omnibench.fit.problem import Improvement
 from omnibench.report.blocks import Block, Column, LegendItem, Paragraph, Row, Table
 from omnibench.report.numbers import NOTHING, count, power_of_ten
@@ -134,38 +136,39 @@ def search_blocks(view: DatasetView) -> Iterator[Block]:
     yield Table("Expected running time", columns, tuple(rows), note)
 
 
-def write_traces(view: DatasetView, folder: Path) -> list[Path]:
+def write_traces(views: Sequence[DatasetView], folder: Path) -> list[Path]:
     """Write the courses of all searches as files that IOHinspector and IOHanalyzer read: the heads of the entries.
 
-    One JSON document an entry with its runs, and beside it the improvements of each run (IOHprofiler's format of 2023:
-    de Nobel et al., IOHexperimenter, Evol. Comput. 32:205, 2024).
+    A folder for each data set, in it one for each entry: a JSON document with its runs, and the improvements of each
+    run (IOHprofiler's format of 2023: de Nobel et al., IOHexperimenter, Evol. Comput. 32:205, 2024). DataError when the
+    disk refuses.
     """
-    groups: dict[str, list[Course]] = {}
-    for course in courses(view):
-        groups.setdefault(course.run.record.label, []).append(course)
-    files, dimension = [], 3 * len(view.dataset.robot.drive.names)
-    for label, group in groups.items():
-        place = folder / "".join(letter if letter.isalnum() else "_" for letter in label)
-        data = place / "data_f1" / f"IOHprofiler_f1_DIM{dimension}.dat"
-        runs, rows = [], []
-        for course in group:
-            record, best = course.run.record, int(np.argmin(course.costs))
-            lowest = {"evals": int(course.evaluations[best]), "y": float(course.costs[best]), "x": []}
-            runs.append({"instance": record.seed, "evals": record.evaluations, "best": lowest})
-            steps = zip(course.evaluations, np.minimum.accumulate(course.costs), strict=True)
-            rows += ["evaluations raw_y", *(f"{int(evaluations)} {cost:.17g}" for evaluations, cost in steps)]
-        head = {
-            "version": "0.3.16",
-            "suite": "omnibench",
-            "function_id": 1,
-            "function_name": f"{view.name} {view.config.objective}",
-            "maximization": False,
-            "algorithm": {"name": label, "info": json.dumps(group[0].run.record.options)},
-            "attributes": ["evaluations", "raw_y"],
-            "scenarios": [{"dimension": dimension, "path": data.relative_to(place).as_posix(), "runs": runs}],
-        }
-        data.parent.mkdir(parents=True, exist_ok=True)
-        data.write_text("\n".join(rows) + "\n", encoding="utf-8")
-        files.append(place / "IOHprofiler_f1_omnibench.json")
-        files[-1].write_text(json.dumps(head, indent=1), encoding="utf-8")
-    return files
+    heads = []
+    for view, of_set in zip(views, file_names(view.name for view in views), strict=True):
+        groups: dict[str, list[Course]] = {}
+        for course in courses(view):
+            groups.setdefault(course.run.record.label, []).append(course)
+        for (label, group), of_entry in zip(groups.items(), file_names(groups), strict=True):
+            dimension = 3 * len(view.dataset.robot.drive.names)
+            data, runs, rows = f"data_f1/IOHprofiler_f1_DIM{dimension}.dat", [], []
+            for course in group:
+                record, best = course.run.record, int(np.argmin(course.costs))
+                lowest = {"evals": int(course.evaluations[best]), "y": float(course.costs[best]), "x": []}
+                runs.append({"instance": record.seed, "evals": record.evaluations, "best": lowest})
+                steps = zip(course.evaluations, np.minimum.accumulate(course.costs), strict=True)
+                rows += ["evaluations raw_y", *(f"{int(evaluations)} {cost:.17g}" for evaluations, cost in steps)]
+            head = {
+                "version": "0.3.16",
+                "suite": "omnibench",
+                "function_id": 1,
+                "function_name": f"{view.name} {view.config.objective}",
+                "maximization": False,
+                "algorithm": {"name": label, "info": json.dumps(group[0].run.record.options)},
+                "attributes": ["evaluations", "raw_y"],
+                "scenarios": [{"dimension": dimension, "path": data, "runs": runs}],
+            }
+            place = folder / of_set / of_entry
+            heads.append(place / "IOHprofiler_f1_omnibench.json")
+            write_text(place / data, "\n".join(rows) + "\n")
+            write_text(heads[-1], json.dumps(head, indent=1))
+    return heads
