@@ -24,7 +24,7 @@ _MODULES = {
     "fit.settings": "Budget FitSettings",
     "live.config": "read_live_config",
     "live.node": "LiveNode",
-    "live.wire.subscriber": "subscribe",
+    "live.subscriber": "subscribe",
     "registry": "load_plugins",
     "robot.calibration": "Calibration odometry read_calibration write_calibration",
     "robot.export.formats": "export_calibration",
@@ -63,7 +63,7 @@ if TYPE_CHECKING:  # imports for type checkers; tests/ground/test_package.py hol
     from omnibench.fit.settings import FitSettings as FitSettings
     from omnibench.live.config import read_live_config as read_live_config
     from omnibench.live.node import LiveNode as LiveNode
-    from omnibench.live.wire.subscriber import subscribe as subscribe
+    from omnibench.live.subscriber import subscribe as subscribe
     from omnibench.registry import load_plugins as load_plugins
     from omnibench.robot.calibration import Calibration as Calibration
     from omnibench.robot.calibration import odometry as odometry

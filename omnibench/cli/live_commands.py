@@ -87,8 +87,8 @@ def _replay_to_node(
     """Play a recording to a node of this process, and show the errors of its odometry."""
     from omnibench.cli.terminal.live_tables import DemonstrationResult, node_log
     from omnibench.config import validate
-    from omnibench.live.replay.concatenated_drive import ReplayConfig, load_recording
-    from omnibench.live.replay.demonstration import demonstrate
+    from omnibench.live.demonstration import demonstrate
+    from omnibench.live.drive import ReplayConfig, load_recording
     from omnibench.live.stopping import stop_on_signals
     from omnibench.report.terminal import print_result
 
@@ -130,11 +130,11 @@ def replay(
     """
     from omnibench.cli.terminal.live_tables import PlayedResult
     from omnibench.config import parse_settings, validate
-    from omnibench.live.network.presence import checked_robot
-    from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_recording, load_recording
-    from omnibench.live.replay.replay_player import Player
+    from omnibench.live.drive import ReplayConfig, concatenate_recording, load_recording
+    from omnibench.live.presence import checked_robot
+    from omnibench.live.replay import Player
     from omnibench.live.stopping import stop_on_signals
-    from omnibench.live.wire.topics import GraphNode
+    from omnibench.live.topics import GraphNode
     from omnibench.report.terminal import print_result
     from omnibench.robot.calibration import read_calibration
 
@@ -189,7 +189,7 @@ def swap(
 
     It holds from the next wheel sample on; the odometry goes on from where it is.
     """
-    from omnibench.live.control.query_server import swap_calibration
+    from omnibench.live.control import swap_calibration
 
     shared.load_given_plugins(plugins)
     with _client(config, connect, None, "swap") as (session, _):
@@ -214,7 +214,7 @@ def record(
     from omnibench.cli.terminal.live_tables import record as write
     from omnibench.live.config import read_live_config
     from omnibench.live.stopping import stop_on_signals
-    from omnibench.live.wire.topics import TOPICS
+    from omnibench.live.topics import TOPICS
 
     refuse_existing(output, force=force)
     if len(robots) == 1 and robots[0].endswith((".yaml", ".yml")):
@@ -242,7 +242,7 @@ def keys(
     force: bool = flag("Replace files that exist, the authority (CA) too.", "--force", "--overwrite"),
 ) -> None:
     """Make a test authority (CA) and certificates for mutual TLS."""
-    from omnibench.live.network.keys import make_keys
+    from omnibench.live.keys import make_keys
 
     chosen = names or ["node", "client"]
     made = make_keys(folder, chosen, router=router, hosts=hosts or (), days=days, users=users, overwrite=force)
@@ -256,9 +256,9 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
     """A client's session, and the keys of the profile."""
     from omnibench.config import validate
     from omnibench.live.config import ClientConfig, read_client_config
-    from omnibench.live.network.session import close_session, open_session
-    from omnibench.live.network.session_config import SessionConfig
-    from omnibench.live.wire.topics import KeySpace
+    from omnibench.live.network import close_session, open_session
+    from omnibench.live.session_config import SessionConfig
+    from omnibench.live.topics import KeySpace
 
     chosen: ClientConfig = ClientConfig() if file is None else read_client_config(file)
     if connect is not None:

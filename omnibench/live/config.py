@@ -10,11 +10,11 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
-from omnibench.live.fusion.pose_fusion import FusionSettings
-from omnibench.live.network.session_config import SessionConfig
-from omnibench.live.replay.concatenated_drive import ReplayConfig
-from omnibench.live.wheels.wheel_input import WheelSettings
-from omnibench.live.wire.topics import Frames, Profile
+from omnibench.live.drive import ReplayConfig
+from omnibench.live.fusion import FusionSettings
+from omnibench.live.session_config import SessionConfig
+from omnibench.live.topics import Frames, Profile
+from omnibench.live.wheels import WheelSettings
 
 # The form of a choice, a name or settings, so that a mistake in one is not explained as one in the other.
 _Form = Discriminator(lambda value: "settings" if isinstance(value, Mapping | Model) else "name")

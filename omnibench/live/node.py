@@ -26,16 +26,16 @@ import zenoh
 from omnibench.environment import package_versions
 from omnibench.errors import one_line, require_type
 from omnibench.live.config import LiveConfig, RobotConfig, robot_called
-from omnibench.live.control.query_server import QueryServer
-from omnibench.live.estimation.health import Health, anomalies_in_words, diagnostic
-from omnibench.live.estimation.robot_state import RobotMemory
-from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.presence import Claim
-from omnibench.live.network.session import close_session, open_session
+from omnibench.live.control import QueryServer
+from omnibench.live.health import Health, anomalies_in_words, diagnostic
+from omnibench.live.network import close_session, open_session
+from omnibench.live.presence import Claim
+from omnibench.live.record import PORT, FoxgloveServer, Recorder, free_path
+from omnibench.live.state import RobotMemory
 from omnibench.live.stopping import Closing, RateLimiter, Stop
-from omnibench.live.wire.messages import Diagnostics, MissedMessages, flow_of
-from omnibench.live.wire.recorder import PORT, FoxgloveServer, Recorder, free_path
-from omnibench.live.wire.topics import OUTPUTS, TOPICS, AcknowledgedFlows, GraphNode, KeySpace, Update
+from omnibench.live.topics import OUTPUTS, TOPICS, AcknowledgedFlows, GraphNode, KeySpace, Update
+from omnibench.live.tracker import RobotTracker
+from omnibench.live.wire import Diagnostics, MissedMessages, flow_of
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural

@@ -18,7 +18,7 @@ from sessions import Loopback, free_port, until
 from timing import load
 
 from omnibench.data.storage import load_dataset
-from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState
+from omnibench.live.wire import JOINT_STATE, ODOMETRY, JointState
 from omnibench.robot.calibration import read_calibration, write_calibration
 
 

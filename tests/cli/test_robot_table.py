@@ -26,8 +26,8 @@ from timing import PATIENCE
 
 from omnibench.cli.terminal.live_tables import listen, plain_line, record, view
 from omnibench.errors import ConfigError, DataError
-from omnibench.live.robot_monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
-from omnibench.live.wire.topics import KeySpace
+from omnibench.live.monitor import HealthSummary, OdometryStatus, RobotMonitor, RobotStatus
+from omnibench.live.topics import KeySpace
 
 KEYS = KeySpace()
 

@@ -25,7 +25,7 @@ from omnibench.data.splits import divided
 from omnibench.data.storage import load_dataset, save_dataset
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.calibrate import calibrate
-from omnibench.live.replay.concatenated_drive import concatenate_runs
+from omnibench.live.drive import concatenate_runs
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
 

@@ -14,7 +14,7 @@ from timing import until
 
 from omnibench.errors import OmnibenchError
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
-from omnibench.live.network.keys import make_keys
+from omnibench.live.keys import make_keys
 
 
 @contextmanager

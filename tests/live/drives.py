@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from omnibench.live.estimation.live_odometry import Motion
-from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.wheels.wheel_input import joints_of
-from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
-from omnibench.live.wire.topics import Update
+from omnibench.live.odometry import Motion
+from omnibench.live.topics import Update
+from omnibench.live.tracker import RobotTracker
+from omnibench.live.wheels import joints_of
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, EffectTerm, Noise, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import Integration, WheelLog

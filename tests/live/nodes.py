@@ -18,7 +18,7 @@ from timing import PATIENCE
 
 from omnibench.live.config import LiveConfig, read_live_config
 from omnibench.live.node import LiveNode
-from omnibench.live.wire.messages import JOINT_STATE, JointState, Odometry
+from omnibench.live.wire import JOINT_STATE, JointState, Odometry
 from omnibench.robot.calibration import write_calibration
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.live.replay.concatenated_drive import Recording
+from omnibench.live.drive import Recording
 from omnibench.robot.calibration import EffectTerm
 from omnibench.robot.kinematics import Array
 from omnibench.robot.model import OdometryModel

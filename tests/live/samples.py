@@ -10,9 +10,9 @@ from commands import disk_that_takes as disk_with_room_for  # noqa: F401 (for th
 from rosbags.highlevel import AnyReader
 from sessions import Loopback, until
 
-from omnibench.live.estimation.health import Counts
-from omnibench.live.wire.messages import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
+from omnibench.live.health import Counts
+from omnibench.live.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
+from omnibench.live.wire import Diagnostic, Diagnostics, JointState, Odometry, PoseEstimate, Transform
 
 STAMP = 1_700_000_000_123_456_789
 PERIOD = 10_000_000  # ns

@@ -8,8 +8,8 @@ from drives import NOISE, PERIOD, Drive
 from sample_robots import fixed, make_robot, steered
 
 from omnibench.data.dataset import Trajectory, make_dataset
-from omnibench.live.replay.concatenated_drive import Recording
-from omnibench.live.wire.messages import JointState
+from omnibench.live.drive import Recording
+from omnibench.live.wire import JointState
 from omnibench.robot.calibration import Calibration, covariance_rows, matrix_rows
 from omnibench.robot.kinematics import Robot
 

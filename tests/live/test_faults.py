@@ -22,7 +22,7 @@ from timing import PATIENCE
 
 from omnibench.config import to_yaml
 from omnibench.live.node import LiveNode
-from omnibench.live.wire.messages import JOINT_STATE, ODOMETRY, JointState, Odometry
+from omnibench.live.wire import JOINT_STATE, ODOMETRY, JointState, Odometry
 
 pytestmark = pytest.mark.slow  # processes that are killed, stopped or frozen
 

@@ -41,7 +41,7 @@ from timing import PATIENCE
 from omnibench.config import to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.config import LiveConfig
-from omnibench.live.control.query_server import (
+from omnibench.live.control import (
     MOST_WAITING,
     QueryServer,
     Request,
@@ -49,16 +49,16 @@ from omnibench.live.control.query_server import (
     source_of,
     swap_calibration,
 )
-from omnibench.live.estimation.health import Health
-from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.network.presence import alive_robots
+from omnibench.live.drive import ReplayConfig, concatenate_runs
+from omnibench.live.health import Health
 from omnibench.live.node import LiveNode
-from omnibench.live.replay.concatenated_drive import ReplayConfig, concatenate_runs
-from omnibench.live.replay.replay_player import Player
+from omnibench.live.presence import alive_robots
+from omnibench.live.record import Recorder
+from omnibench.live.replay import Player
 from omnibench.live.stopping import RateLimiter, stop_on_signals, ticks
-from omnibench.live.wire.messages import DIAGNOSTICS, JOINT_STATE, ODOMETRY, TRANSFORMS, Odometry, packed
-from omnibench.live.wire.recorder import Recorder
-from omnibench.live.wire.topics import TOPICS, GraphNode, KeySpace
+from omnibench.live.topics import TOPICS, GraphNode, KeySpace
+from omnibench.live.tracker import RobotTracker
+from omnibench.live.wire import DIAGNOSTICS, JOINT_STATE, ODOMETRY, TRANSFORMS, Odometry, packed
 from omnibench.robot.calibration import write_calibration
 
 

@@ -14,17 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.live.estimation.tracker import RobotTracker
-from omnibench.live.fusion.pose_fusion import FusionSettings
-from omnibench.live.replay.concatenated_drive import (
+from omnibench.live.drive import (
     ConcatenatedDrive,
     ReplayConfig,
     concatenate_recording,
     concatenated_truth,
     load_recording,
 )
-from omnibench.live.replay.replay_player import ReplayMessages
-from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.fusion import FusionSettings
+from omnibench.live.replay import ReplayMessages
+from omnibench.live.tracker import RobotTracker
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, read_calibration
 from omnibench.robot.model import OdometryModel
 

@@ -29,8 +29,8 @@ import yaml
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
-from omnibench.live.wheels.wheel_input import joints_of
-from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.wheels import joints_of
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, Noise, matrix_rows, write_calibration
 from omnibench.robot.kinematics import Robot as Base
 from omnibench.testing.synthetic import synthetic_robot

@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 from live_latency import OMNI, client, node
 
-from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 
 
 def samples_taken(session: zenoh.Session) -> int:

@@ -19,12 +19,12 @@ from rich.text import Text
 
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import DataError, one_line
-from omnibench.live.estimation.health import anomalies_in_words
-from omnibench.live.network.presence import alive_robots, nothing_received
-from omnibench.live.robot_monitor import OdometryStatus, RobotMonitor, RobotStatus, json_document
+from omnibench.live.health import anomalies_in_words
+from omnibench.live.monitor import OdometryStatus, RobotMonitor, RobotStatus, json_document
+from omnibench.live.presence import alive_robots, nothing_received
+from omnibench.live.record import Recorder
 from omnibench.live.stopping import ticks
-from omnibench.live.wire.recorder import Recorder
-from omnibench.live.wire.topics import TOPICS, KeySpace
+from omnibench.live.topics import TOPICS, KeySpace
 from omnibench.progress import Progress
 from omnibench.report.blocks import Column, Row, RowRole, Table
 from omnibench.report.numbers import fixed
@@ -33,8 +33,8 @@ from omnibench.report.terminal import render_table
 from omnibench.words import plural
 
 if TYPE_CHECKING:
-    from omnibench.live.replay.demonstration import Demonstration
-    from omnibench.live.replay.replay_player import PlayReport
+    from omnibench.live.demonstration import Demonstration
+    from omnibench.live.replay import PlayReport
 
 
 class LogLines(logging.Handler):

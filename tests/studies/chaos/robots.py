@@ -14,10 +14,10 @@ import zenoh
 
 from omnibench.data.dataset import Trajectory, make_dataset
 from omnibench.data.storage import load_dataset, save_dataset
-from omnibench.live.network.session import is_connected
-from omnibench.live.replay.concatenated_drive import concatenate_runs
-from omnibench.live.wire.messages import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
-from omnibench.live.wire.topics import GraphNode
+from omnibench.live.drive import concatenate_runs
+from omnibench.live.network import is_connected
+from omnibench.live.topics import GraphNode
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration, Noise, matrix_rows
 from omnibench.robot.kinematics import Array
 from omnibench.robot.odometry import WheelLog

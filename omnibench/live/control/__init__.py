@@ -1,1 +1,0 @@
-"""Queries and orders: a node's query server and its clients."""

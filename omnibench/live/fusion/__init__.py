@@ -1,1 +1,0 @@
-"""Fusion: SLAM poses and odometry brought together, each at its own time."""

@@ -1,1 +1,0 @@
-"""Zenoh sessions: opening them, access rights, and which robots are present."""

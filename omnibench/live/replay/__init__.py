@@ -1,1 +1,0 @@
-"""Recordings replayed on Zenoh as a robot and its SLAM would send them."""

@@ -1,1 +1,0 @@
-"""Wheel messages put in order, repaired or refused: how the wheels turned and steered from sample to sample."""

@@ -1,1 +1,0 @@
-"""Messages on the network and in files: ROS 2 types, topics, MCAP recordings, Foxglove."""
