@@ -8,7 +8,7 @@ from drives import EXACT, ORIGIN, PERIOD, SECOND, calibration, drive, fed, motio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omnibench.live.fusion import pose_fusion
+from omnibench.live import fusion as pose_fusion
 from omnibench.live.health import Counts
 from omnibench.live.odometry import Motion
 from omnibench.live.tracker import RobotTracker
