@@ -389,6 +389,17 @@ def read_matrix(
     return PhysicalReading(tuple(parameters), _doubt(robot, parameters, fitted_mount))
 
 
+def directions_of(robot: Robot) -> Mapping[str, tuple[float, Array]]:
+    """Design value and derivatives (3M,) of the matrix elements, row by row, of each physical parameter by its name."""
+    model = _class_model(robot, fitted_mount=False, of_effects=())
+    slopes = model.geometry.slopes(model.geometry.design) @ model.spread
+    found = {}
+    for (name, design), reported in zip(model.design.items(), model.reported, strict=True):
+        if reported.any():
+            found[name] = design, slopes @ np.linalg.pinv(reported[None])[:, 0]
+    return found
+
+
 def _split(slopes: Array) -> tuple[Array, Array]:
     """Orthonormal changes (k, r) and (k, k - r) that slopes (q, k) show and do not show."""
     _, strengths, directions = np.linalg.svd(slopes)

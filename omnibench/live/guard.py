@@ -1,0 +1,785 @@
+"""The guard: whether a robot still moves as its calibration says and, where it does not, what has changed.
+
+Between two reference poses the calibration predicts a motion. An extended Kalman filter follows the pose of the tracked
+point (x, y, heading), the delay of the reference's stamps and the offset of its heading; with innovations v of covariance
+S, and C the derivative of a measurement by the state. Let q hold whatever may have changed: elements of the matrix,
+encoders that stand still, the delay. A change by q moves the mean of v by H q,
+
+    B <- F B + G,    H = C B + m,    B <- B - K H,                                                              (G1)
+
+with F the filter's transition, K its gain, G the derivative of the predicted motion and m that of the measurement. The
+sums over stretches of about one metre, the blocks,
+
+    A = sum H' S^-1 H,    b = sum H' S^-1 v,                                                                     (G2)
+
+hold all that the innovations tell of q. What the calibration does not know of its matrix, covariance P, is no change:
+
+    (A~, b~) = (I + A P)^-1 (A, b),    T = (d' b~)^2 / (d' A~ d)                                                 (G3)
+
+is twice the generalised likelihood ratio of the hypothesis that q changed along d, such as by the radius of one wheel,
+since the first of the blocks (Willsky and Jones, IEEE T-AC 21:108, 1976). A robot that scatters more than its calibration
+states does so from block to block, too: Birge's ratio l (Phys. Rev. 40:207, 1932) of the blocks' estimates of d' q, before
+and after the change, widens S. With n degrees of freedom, n0 of which stand for the calibration's word,
+
+    h = (n + 1)/2 log(1 + T / (l n))                                                                             (G4)
+
+takes the place of T/2. A change is told when h exceeds log(looks / alpha), which bounds false alarms by alpha over all
+looks; hypotheses whose h is within log(20) of the best are alternatives to it.
+
+One block's estimate is wrong where the robot was pushed, a wheel slipped on an edge, or the reference jumped: a step of
+the pose at one stretch that explains the last innovations better than any change. It is told as such, the filter goes
+on from there, and nothing of it enters a block.
+
+A proposal is the changed parameter with its new value. Blocks that come later decide between it and the old one by the
+likelihood ratio, an e-value (Grunwald et al., JRSS B 86:1091, 2024): the k-th proposal is accepted at an error of
+alpha / (k (k + 1)), over all looks, and rolled back when the ratio speaks against it later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from omnibench.config import Model
+from omnibench.errors import DataError
+from omnibench.live.odometry import UNKNOWN_NOISE
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array, CarDrive, pose_covariance, rotation
+from omnibench.robot.odometry import chord_shares
+from omnibench.robot.physical import directions_of, unit_of
+
+_ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal; chosen
+_LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years; chosen
+THRESHOLD: Final = math.log(_LOOKS / _ALPHA)  # of h, Eq. (G4)
+_APART: Final = math.log(20.0)  # of h between a name and its alternatives; chosen, as 95 %
+_STATED: Final = 12.0  # n0 of Eq. (G4); chosen
+_METRES: Final = 1.0  # that the wheels roll in a block; chosen, as slip decorrelates within 2 m
+_ALIKE: Final = 6  # blocks of a length, beyond which the two oldest become one of twice the length; chosen
+_RECENT: Final = 8  # stretches at which a step is looked for, and which are not yet in a block; chosen
+_DELAY: Final = 0.1  # s, standard deviation of the delay of a reference's stamps when a run begins; chosen
+_LASTING: Final = 0.8  # share of that after another stretch; chosen
+_RUNS: Final = 2.0  # runs for which that counts; chosen
+_OFFSET: Final = 0.003  # rad, least standard deviation of a reference's heading offset in a run; chosen
+_STRONG: Final = 0.04  # share of a radius: no tyre changes by more, but a wheel slips or its encoder errs; chosen
+_UNSTATED: Final = 0.002  # of each row's largest element: what a calibration without a covariance does not know; chosen
+LEAST_POSES: Final = 0.2  # s between two poses that are compared; chosen
+_LEAST_SLIP: Final = 1e-4  # rad and m per root metre: nothing rolls more exactly; chosen
+_NO_ANGLE: Final = 1e-9  # rad or m in a stretch: an encoder that stands still
+_CLIP: Final = 4.0  # of the norm of an innovation by its deviation: more counts as so much (Huber); chosen
+_SQUARES: Final = 32  # innovations of which the median is taken; chosen
+_REMEMBERED: Final = 256  # innovations whose tail is compared with that of normal ones; chosen
+_RARE: Final = 9.837  # 0.98 quantile of chi-square with 3 degrees of freedom
+_MEDIAN: Final = 2.366  # of chi-square with 3 degrees of freedom
+_LEAST_PLACE: Final = 1e-4  # m, standard deviation of a reference's position; chosen
+_LEAST_HEADING: Final = 1e-4  # rad, of its heading; chosen
+_WRONG_SPEED: Final = 1.0  # m/s, least speed that tells a jump of the reference from a push; chosen
+_SAME_BURST: Final = 5.0  # s within which bursts are one; chosen
+_PASSING: Final = ("burst", "reference")
+_SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual; chosen
+_LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change; chosen
+_LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
+_LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
+_SCALES: Final = (1, 4, 16)  # blocks that Birge's ratio joins, as slip may last; chosen
+
+Kind = Literal["change", "fault", "burst", "reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of what it is named after.
+
+    values (P,): the calibration's. kinds, units: of each. wheels: plain wheels whose encoder may stand still, with
+    their columns of the matrix. largest (P,): changes that are believed. untold (q, q): covariance P of Eq. (G3).
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    units: tuple[str, ...]
+    values: Array
+    directions: Array
+    wheels: tuple[int, ...]
+    largest: Array
+    untold: Array
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Hypotheses:
+        """The hypotheses on the robot of a calibration."""
+        robot, matrix = calibration.robot, calibration.matrix_array
+        size = matrix.size
+        wheels = tuple(range(len(robot.wheel_names))) if robot.drive.direct else ()
+        count = size + len(wheels) + 1
+        rows: list[tuple[str, Kind, str, float, Array]] = []
+        changes = directions_of(robot)
+        try:
+            known: Mapping[str, float] = {n: each.value for n, each in calibration.physical_parameters.items()}
+        except DataError:  # no wheels have this matrix
+            known = {}
+        for name, (design, change) in changes.items():
+            rows.append((name, "change", unit_of(name), known.get(name, design), change))
+        floor = np.sum([design * change for n, (design, change) in changes.items() if n.startswith("radius")], axis=0)
+        rows.append(("floor", "change", "1", 1.0, floor))
+        scale = (matrix * np.array([[1.0], [1.0], [0.0]])).ravel()
+        rows.append(("reference_scale", "reference", "1", 1.0, scale))
+        directions = np.zeros((count, len(rows) + len(wheels) + 1))
+        directions[:size, : len(rows)] = np.column_stack([row[4] for row in rows])
+        directions[size:, len(rows) :] = np.eye(len(wheels) + 1)
+        encoders = [f"encoder_{robot.wheel_names[wheel]}" for wheel in wheels]
+        untold = np.zeros((count, count))
+        if calibration.covariance is None:
+            untold[:size, :size] = np.diag(np.repeat((_UNSTATED * robot.row_scales) ** 2, matrix.shape[1]))
+        else:
+            untold[:size, :size] = np.array(calibration.covariance)[:size, :size]
+        return cls(
+            (*(row[0] for row in rows), *encoders, "reference_clock"),
+            (*(row[1] for row in rows), *["fault"] * len(encoders), "reference"),
+            (*(row[2] for row in rows), *["1"] * len(encoders), "s"),
+            np.array([*(row[3] for row in rows), *[1.0] * len(encoders), 0.0]),
+            directions,
+            wheels,
+            np.array([*(_LARGEST_SHARE * _size(row) for row in rows), *[2.0] * len(encoders), 3.0]),
+            untold,
+        )
+
+
+def _size(row: tuple[str, Kind, str, float, Array]) -> float:
+    """The size of a hypothesis's parameter: its value, or 1 rad."""
+    return 1.0 if row[2] == "rad" else abs(row[3])
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The motion between two reference poses, as a calibration predicts it, in the robot's frame at its begin.
+
+    moved (3,): m, m, rad. slopes (3, q): its derivatives G. spread (3, 3): covariance that slip adds. rolled: m that
+    the wheels rolled in the mean. way: m that the tracked point went. seconds. begun, velocity (3,): at its begin and end, in the frame of its begin, m/s,
+    m/s, rad/s.
+    """
+
+    moved: Array
+    slopes: Array
+    spread: Array
+    rolled: float
+    way: float
+    seconds: float
+    begun: Array
+    velocity: Array
+
+
+class Predictor:
+    """Makes stretches of wheel samples, by a calibration's noise and geometry."""
+
+    def __init__(self, calibration: Calibration, hypotheses: Hypotheses) -> None:
+        robot, noise, slip = calibration.robot, calibration.noise or UNKNOWN_NOISE, calibration.slip
+        self._robot = robot
+        self._arc = calibration.integration == "arc"
+        self.reach, self._matrix, self._radii = robot.reach, calibration.matrix_array, robot.radii
+        self._wheels = hypotheses.wheels
+        # Contacts slip independently, as much as turns the robot as its training runs were turned.
+        turning = math.sqrt(float(np.square(self._matrix[2] / self._of_wheel(self._radii)).sum()))
+        self._by_metre = slip is not None
+        walk = noise.walk_heading or UNKNOWN_NOISE.walk_heading
+        self._contact = max(walk if slip is None else slip.heading, _LEAST_SLIP) / max(turning, 1e-9)
+
+    def _of_wheel(self, values: Array) -> Array:
+        """Values (..., M) of the wheels of the drive signals, from those (..., N) of the wheels."""
+        signals = self._matrix.shape[1]
+        if self._robot.drive.direct:
+            return values
+        if isinstance(self._robot.drive, CarDrive):
+            return np.repeat(values.mean(axis=-1, keepdims=True), signals, axis=-1)
+        counts = [2 if wheel.has_steering else 1 for wheel in self._robot.measured]
+        return np.repeat(values, counts, axis=-1)
+
+    def stretch(self, moved: Array, driven: Array, seconds: Array) -> Stretch:
+        """The stretch of n samples: motions (n, 3), integrals (n, M) of the drive signals, durations (n,), s."""
+        turn = moved[:, 2]
+        before = np.cumsum(turn) - turn
+        unit = np.exp(1j * (before + turn / 2)) * chord_shares(turn / 2) if self._arc else np.exp(1j * before)
+        steps = (moved[:, 0] + 1j * moved[:, 1]) * unit
+        after = np.cumsum(steps)
+        end = after[-1]
+        lever = end - after + steps / 2  # from the middle of each sample to the end
+        by_place, by_turn = unit @ driven, (1j * lever) @ driven
+        count, signals = len(self._wheels), driven.shape[1]
+        slopes = np.zeros((3, 3 * signals + count + 1))
+        by_row = slopes[:, : 3 * signals].reshape(3, 3, signals)
+        by_row[0] = by_place.real, -by_place.imag, by_turn.real
+        by_row[1] = by_place.imag, by_place.real, by_turn.imag
+        by_row[2, 2] = total = driven.sum(axis=0)
+        rolled = np.hypot(moved[:, 0], moved[:, 1]) + self.reach * np.abs(turn)
+        if count:  # an encoder that stands still while the others turn hides about as much
+            angles = np.abs(driven).sum(axis=0) * self._radii
+            for place, wheel in enumerate(self._wheels):
+                if angles[wheel] < _NO_ANGLE and (others := angles.sum() / (count - 1)) > _LEAST_STEP:
+                    hidden = np.array([[self._matrix[0, wheel]], [self._matrix[1, wheel]], [self._matrix[2, wheel]]])
+                    slopes[:, 3 * signals + place] = (hidden * others / self._radii[wheel])[:, 0]
+        # Slip of each contact, and half as much of the place in all directions.
+        metres = np.abs(driven) * self._of_wheel(self._radii) if self._by_metre else np.repeat(seconds[:, None], signals, 1)
+        metres[rolled <= 0] = 0.0
+        carried = np.zeros((len(seconds), 3, 3))
+        carried[:, 0, 0] = carried[:, 1, 1] = unit.real
+        carried[:, 1, 0], carried[:, 0, 1] = unit.imag, -unit.imag
+        carried[:, 0, 2], carried[:, 1, 2], carried[:, 2, 2] = -lever.imag, lever.real, 1.0
+        slipping = carried @ (self._matrix / self._of_wheel(self._radii)) * np.sqrt(metres)[:, None]
+        slipping = np.swapaxes(slipping, 0, 1).reshape(3, -1)
+        spread = slipping @ slipping.T
+        spread[0, 0] += (anywhere := float(metres.mean(axis=1).sum()) / 4)
+        spread[1, 1] += anywhere
+        spread *= self._contact**2
+        duration = float(seconds.sum())
+        begun, velocity = (
+            np.array([steps[k].real, steps[k].imag, turn[k]]) / max(float(seconds[k]), 1e-9) for k in (0, -1)
+        )
+        whole = np.array([end.real, end.imag, turn.sum()])
+        way = float(np.abs(steps).sum())
+        return Stretch(whole, slopes, spread, float(rolled.sum()), way, duration, begun, velocity)
+
+
+class Alarm(Model):
+    """What the guard tells: of a change or a fault its name, value and 95 % interval; of the others their size.
+
+    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low, high:
+    in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
+    detected_after_m: m that the wheels rolled between the two. alternatives: names that explain it nearly as well, of
+    which ``advice`` says how to tell them apart.
+    """
+
+    kind: Kind
+    name: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    unit: str
+    trajectory: str
+    t: float
+    since: str
+    since_t: float
+    detected_after_m: float
+    alternatives: tuple[str, ...] = ()
+    advice: str = ""
+
+
+class HeldOut(Model):
+    """A proposal judged by motion after it was made. log_e: log of the likelihood ratio; ratio: of the errors."""
+
+    metres: float
+    log_e: float
+    error_ratio: float | None
+
+
+class Proposal(Model):
+    """A parameter with a new value, in shadow beside the calibration's. accepted: None while it is not decided."""
+
+    name: str
+    value: float
+    accepted: bool | None = None
+    rolled_back: bool = False
+    reason: str = ""
+    held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time, s, of a run, and the metres rolled until then, of all runs."""
+
+    trajectory: str
+    t: float
+    metres: float
+
+
+@dataclass(eq=False)
+class _Sums:
+    """Eq. (G2): A (q, q), b (q,); along the hypotheses a, b (P,), their b^2 / a, of ``count`` blocks; since when."""
+
+    whole: Array
+    score: Array
+    a: Array
+    b: Array
+    scatter: Array
+    rolled: float
+    since: Moment
+    count: int = 1
+
+    def add(self, other: _Sums) -> None:
+        self.whole, self.score = self.whole + other.whole, self.score + other.score
+        self.a, self.b = self.a + other.a, self.b + other.b
+        self.rolled += other.rolled
+
+
+@dataclass(frozen=True, eq=False)
+class _Verdict:
+    """The best hypothesis over onsets: h (P,), changes and deviations (P,), Birge's ratios (P,), and the first block."""
+
+    h: Array
+    change: Array
+    deviation: Array
+    ratio: Array
+    first: int
+
+    @property
+    def best(self) -> int:
+        return int(self.h.argmax())
+
+
+class Guard:
+    """Watches one robot against its calibration. ``begin`` each run, then ``take`` each stretch and the pose after it.
+
+    alarms, proposals: all so far; the last of each may still change. log: told each that is new or has changed.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.hypotheses = Hypotheses.of(calibration)
+        self.predictor = Predictor(calibration, self.hypotheses)
+        noise = calibration.noise or UNKNOWN_NOISE
+        place = max(noise.pose_position, _LEAST_PLACE)
+        self._usual = pose_covariance(place, math.degrees(max(noise.pose_heading, _LEAST_HEADING)))
+        self._offset = max(noise.bias_heading, _OFFSET)
+        self.alarms: list[Alarm] = []
+        self.proposals: list[Proposal] = []
+        self.metres = self.seconds = 0.0
+        count = len(self.hypotheses.untold)
+        self._untold = self.hypotheses.untold.copy()
+        self._assumed, self._delay = np.zeros(count), 0.0
+        self._delays: list[float] = []  # of the runs so far
+        self._delay_variance = _DELAY**2
+        self._adopted: dict[int, float] = {}  # hypothesis -> change
+        self._blocks: list[_Sums] = []
+        self._block: _Sums | None = None
+        self._recent: deque[tuple[_Sums, Array, float]] = deque()
+        self._squares: list[float] = []
+        self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
+        self._usual_ratio = np.ones(len(self.hypotheses.names))
+        told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _STATED), _LONGEST_MEMORY)
+        self._freedom = np.full(len(self.hypotheses.names), float(told))
+        self._alarm: int | None = None  # hypothesis of the alarm that is open
+        self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
+        self._kept: tuple[int, float, float] | None = None  # accepted: hypothesis, change, log of e of the old value
+        self._ratio = 1.0
+        self._last_burst = -math.inf
+        self._begun = False
+
+    def begin(self, pose: Array, covariance: Array | None = None) -> None:
+        """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""
+        self._flush()
+        if self._begun:  # delays that differ from run to run are no change of the reference
+            self._delays.append(float(self._state[3]))
+            spread = np.square(np.array(self._delays) - np.mean(self._delays)).sum() + _RUNS * _DELAY**2
+            self._delay_variance = float(spread) / (_RUNS + len(self._delays))
+            self._untold[-1, -1] = self._delay_variance
+        self._state = np.array([*pose.tolist(), self._delay, 0.0])
+        self._covariance = np.zeros((5, 5))
+        self._covariance[:3, :3] = self._usual if covariance is None else covariance
+        self._covariance[3, 3] = self._delay_variance
+        variance = self._offset**2
+        self._covariance[2, 2] += variance
+        self._covariance[2, 4] = self._covariance[4, 2] = -variance
+        self._covariance[4, 4] = variance
+        self._deviation = np.zeros((5, len(self._assumed)))  # B of Eq. (G1)
+        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self._faster = np.zeros((3, 3))
+        self._begun = False
+
+    def take(
+        self, stretch: Stretch, pose: Array, at: tuple[str, float], covariance: Array | None = None
+    ) -> list[Alarm]:
+        """Compare a stretch with the reference pose (3,) at its end; the alarms that are new or have changed.
+
+        at: name of the run and time in it, s. covariance: as of ``begin``.
+        """
+        self.metres, self.seconds = self.metres + stretch.way, self.seconds + stretch.seconds
+        speed = stretch.rolled / max(stretch.seconds, 1e-9)
+        self._fastest = max(self._fastest, speed)
+        # Predict, Eq. (G1).
+        state, heading = self._state, float(self._state[2])
+        turn = rotation(heading)
+        slopes = turn @ stretch.slopes
+        if not self._begun:  # what the reference tells of a robot that moves already is late
+            first = turn @ stretch.begun
+            delayed = np.array([*first.tolist(), 1.0, 0.0])
+            self._covariance[3, 3] = 0.0
+            self._covariance += self._delay_variance * delayed[:, None] * delayed
+            self._begun = True
+        moved = turn @ stretch.moved + slopes @ self._assumed
+        state[:3] += moved
+        transition = np.eye(5)
+        transition[0, 2], transition[1, 2] = -moved[1], moved[0]
+        self._covariance = transition @ self._covariance @ transition.T
+        self._covariance[:3, :3] += turn @ stretch.spread @ turn.T
+        self._deviation = transition @ self._deviation
+        self._deviation[:3] += slopes
+        arrived = np.zeros((1, 5, 3))
+        arrived[0, :3] = np.eye(3)
+        self._steps = np.concatenate([transition @ self._steps, arrived])[-_RECENT:]
+        self._step_a = np.concatenate([self._step_a, np.zeros((1, 3, 3))])[-_RECENT:]
+        self._step_b = np.concatenate([self._step_b, np.zeros((1, 3))])[-_RECENT:]
+        # Measure.
+        velocity = turn @ stretch.velocity
+        measured = np.zeros((3, 5))
+        measured[:, :3], measured[:, 3], measured[2, 4] = np.eye(3), -velocity, 1.0
+        innovation = pose - measured @ state
+        innovation[2] -= math.tau * round(float(innovation[2]) / math.tau)
+        noise = self._usual if covariance is None else covariance
+        faster = turn @ (stretch.velocity - stretch.begun)  # a delay shows while the velocity changes, in part
+        spread = measured @ self._covariance @ measured.T + self._scale * noise
+        self._faster = _LASTING * self._faster + faster[:, None] * faster
+        spread += self._delay_variance * self._faster
+        information = np.linalg.inv(spread)
+        square = float(innovation @ information @ innovation)
+        self._squares.append(square)
+        if len(self._squares) % _SQUARES == 0:  # a reference that scatters more than it says counts for less
+            self._scale = max(1.0, self._scale * float(np.median(self._squares[-_SQUARES:])) / _MEDIAN)
+            self._squares = self._squares[-_REMEMBERED:]
+            self._tail = max(1.0, float(np.quantile(self._squares, 0.98)) / _RARE)
+        weight = min(1.0, _CLIP / math.sqrt(max(square, 1e-12)))
+        gain = weight * self._covariance @ measured.T @ information
+        slope = measured @ self._deviation
+        slope[:, -1] -= velocity
+        told = slope.T @ information
+        along = slope @ self.hypotheses.directions
+        told_along = along.T @ information
+        whole = told @ slope
+        now = Moment(*at, self.metres)
+        sums = _Sums(
+            whole,
+            weight * (told @ innovation),
+            np.einsum("ij,ji->i", told_along, along),
+            told_along @ innovation,
+            np.zeros(len(self.hypotheses.names)),
+            stretch.rolled,
+            now,
+        )
+        self._recent.append((sums, stretch.seconds, weight))
+        of_steps = measured @ self._steps
+        self._step_a += np.swapaxes(of_steps, 1, 2) @ information @ of_steps
+        self._step_b += np.swapaxes(of_steps, 1, 2) @ (information @ innovation)
+        state += gain @ innovation
+        self._covariance -= gain @ measured @ self._covariance
+        self._deviation -= gain @ slope
+        self._steps = self._steps - gain @ of_steps
+        burst = self._find_step(now)
+        if burst is not None:
+            return burst
+        # What is older than any step enters the block.
+        if len(self._recent) > _RECENT:
+            return self._enter()
+        return []
+
+    def _find_step(self, now: Moment) -> list[Alarm] | None:
+        """Tell a step of the pose at one of the last stretches, where it explains them better than any change."""
+        tail = max(self._tail, self._ratio)
+        regular = self._step_a + 1e-9 * np.eye(3)
+        steps = np.linalg.solve(regular, self._step_b[:, :, None])[:, :, 0]
+        gains = np.einsum("ij,ij->i", self._step_b, steps) / (2 * tail)
+        at = int(gains.argmax())
+        if gains[at] <= THRESHOLD:
+            return None
+        # Changes since any of these stretches, with or without the block before them.
+        parts = [sums for sums, _, _ in self._recent]
+        b = np.cumsum([part.b for part in reversed(parts)], axis=0)
+        a = np.cumsum([part.a for part in reversed(parts)], axis=0)
+        rival = (b * b / (2 * tail * np.maximum(a, 1e-12))).max()
+        if rival > gains[at] - _APART:
+            return None
+        step = steps[at]
+        if max(math.hypot(step[0], step[1]), abs(float(step[2])) * max(self.predictor.reach, 0.1)) < _LEAST_STEP:
+            return None
+        dropped = len(self._steps) - at
+        seconds = sum(self._recent[-k][1] for k in range(1, min(dropped, len(self._recent)) + 1)) / max(dropped, 1)
+        rolled = sum(self._recent[-k][0].rolled for k in range(1, min(dropped, len(self._recent)) + 1))
+        since = self._recent[-min(dropped, len(self._recent))][0].since
+        self._state += self._steps[at] @ step
+        spread = np.linalg.inv(regular[at])
+        self._covariance += self._steps[at] @ spread @ self._steps[at].T
+        for _ in range(min(dropped, len(self._recent))):
+            self._recent.pop()
+        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        size = math.hypot(step[0], step[1])
+        again = self._last_burst > self.seconds - _SAME_BURST and self.alarms and self.alarms[-1].kind in _PASSING
+        self._last_burst = self.seconds
+        jumped = not again and size / max(seconds, 1e-9) > max(_WRONG_SPEED, 2 * self._fastest)
+        turned = abs(float(step[2]))
+        value, unit = (size, "m") if size > turned * max(self.predictor.reach, 0.1) else (turned, "rad")
+        name = "reference_jump" if jumped else "push" if rolled < size / 2 else "slip"
+        if again:
+            value = value + (self.alarms[-1].value or 0.0) if unit == self.alarms[-1].unit else value
+            name = "push" if self.alarms[-1].name == "reference_jump" else self.alarms[-1].name
+            since = Moment(self.alarms[-1].since, self.alarms[-1].since_t, since.metres)
+            self.alarms.pop()
+        kind: Kind = "reference" if name == "reference_jump" else "burst"
+        alarm = Alarm(
+            kind=kind,
+            name=name,
+            value=float(value),
+            unit=unit,
+            trajectory=now.trajectory,
+            t=now.t,
+            since=since.trajectory,
+            since_t=since.t,
+            detected_after_m=max(now.metres - since.metres, 0.0),
+        )
+        self.alarms.append(alarm)
+        return [alarm]
+
+    def _enter(self) -> list[Alarm]:
+        """Add the oldest stretch to the block, which is judged when it is long enough."""
+        sums, _, _ = self._recent.popleft()
+        sums.b = self.hypotheses.directions.T @ sums.score
+        if self._block is None:
+            self._block = sums
+        else:
+            self._block.add(sums)
+        if self._block.rolled < _METRES:
+            return []
+        return self._judge()
+
+    def _flush(self) -> None:
+        """Enter what waits, at the end of a run."""
+        while self._recent:
+            self._enter()
+
+    def _judge(self) -> list[Alarm]:
+        """Close the block; judge all of them, the alarm that is open, and what is in shadow."""
+        block, self._block = self._block, None
+        assert block is not None
+        block.scatter = block.b**2 / np.maximum(block.a, 1e-12)
+        self._blocks.append(block)
+        # Older blocks are joined by twos, so that windows of all lengths remain.
+        size = 1
+        while sum(each.count == size for each in self._blocks) > _ALIKE:
+            first = next(k for k, each in enumerate(self._blocks) if each.count == size)
+            older, newer = self._blocks[first : first + 2]
+            older.add(newer)
+            older.scatter, older.count = older.scatter + newer.scatter, 2 * size
+            del self._blocks[first + 1]
+            size *= 2
+        verdict = self._verdict()
+        self._ratio = float(np.median(verdict.ratio))
+        self._weigh(block, verdict)
+        if not self._blocks or (self._alarm is None and verdict.h[verdict.best] <= THRESHOLD):
+            return []
+        return self._tell(verdict)
+
+    def _verdict(self) -> _Verdict:
+        """Eq. (G3) and (G4) for changes since several of the blocks."""
+        count = len(self._blocks)
+        a, b, scatter = (np.array([getattr(block, name) for block in self._blocks]) for name in ("a", "b", "scatter"))
+        numbers = np.array([block.count for block in self._blocks])
+        firsts = list(range(count))
+        ratios = np.ones((len(firsts), a.shape[1]))
+        freedom = self._freedom + max(int(numbers.sum()) - 2, 0)
+        for scale in _SCALES:
+            places = (np.cumsum(numbers) - numbers) // scale
+            edges = np.flatnonzero(np.diff(places, prepend=-1))
+            ga, gb, sizes = (np.add.reduceat(rows, edges, axis=0) for rows in (a, b, numbers))
+            within = scatter if scale == 1 else gb**2 / np.maximum(ga, 1e-12)
+            groups = sizes if scale == 1 else np.ones(len(edges))
+            before = _scatter_within(ga, gb, within, groups)
+            after = [row[::-1] for row in _scatter_within(ga[::-1], gb[::-1], within[::-1], groups[::-1])]
+            for row, first in enumerate(firsts):
+                right = int(np.searchsorted(edges, first))  # groups wholly after, and wholly before
+                left = right if right < len(edges) and edges[right] == first else max(right - 1, 0)
+                squares, free = before[0][left] + after[0][right], before[1][left] + after[1][right]
+                ratio = (self._freedom * self._usual_ratio + squares) / (self._freedom + free)
+                ratios[row] = np.maximum(ratios[row], ratio)
+        # What the blocks before tell of what the calibration does not know, and what is left of it.
+        wholes, scores = (
+            np.cumsum([np.zeros_like(getattr(self._blocks[0], name)), *(getattr(each, name) for each in self._blocks)], 0)
+            for name in ("whole", "score")
+        )
+        common = np.median(ratios, axis=1)
+        identity, untold = np.eye(len(self._untold)), self._untold
+        before = wholes[firsts] / common[:, None, None]
+        known = np.linalg.solve(identity + untold @ before, np.broadcast_to(untold, before.shape))
+        whole = (wholes[-1] - wholes[firsts]) / common[:, None, None]
+        score = (scores[-1] - scores[firsts]) / common[:, None]
+        mean = (known @ (scores[firsts] / common[:, None])[:, :, None])[:, :, 0]
+        score -= (whole @ mean[:, :, None])[:, :, 0]
+        joint = np.linalg.solve(identity + whole @ known, np.concatenate([whole, score[:, :, None]], axis=2))
+        directions = self.hypotheses.directions
+        along = np.einsum("qp,fqr,rp->fp", directions, joint[:, :, :-1], directions)
+        slope = joint[:, :, -1] @ directions
+        along = np.maximum(along, 1e-12)
+        shrunk = np.minimum(common[:, None] / ratios, 1.0)
+        h = (freedom + 1) / 2 * np.log1p(shrunk * slope**2 / along / freedom)
+        h[np.abs(slope / along) > self.hypotheses.largest] = 0.0
+        row = int(h.max(axis=1).argmax())
+        deviation = np.sqrt(1 / along[row] / shrunk[row])
+        return _Verdict(h[row], slope[row] / along[row], deviation, ratios[row], firsts[row])
+
+    def _tell(self, verdict: _Verdict) -> list[Alarm]:
+        """Tell a change, or more of the one that is open; propose its value, and go on from it when it is settled."""
+        best, hypotheses = verdict.best, self.hypotheses
+        since = self._blocks[verdict.first].since
+        now = self._blocks[-1].since
+        told = self._alarm is not None
+        if verdict.h[best] > THRESHOLD or not told:
+            alarm = self._alarm_of(verdict, since)
+            if told:
+                first = self.alarms[self._open_at]
+                kept = {name: getattr(first, name) for name in ("trajectory", "t", "detected_after_m")}
+                changed = alarm.model_copy(update=kept)
+                self.alarms[self._open_at] = alarm = changed
+            else:
+                self._open_at, self._told_at = len(self.alarms), self.metres
+                self.alarms.append(alarm)
+            self._alarm = best
+        else:
+            alarm = self.alarms[self._open_at]
+        assert self._alarm is not None
+        named, change, variance = self._alarm, float(verdict.change[self._alarm]), 0.0
+        variance = float(verdict.deviation[named]) ** 2
+        proposable = alarm.kind == "change" and hypotheses.names[named] != "floor" and not alarm.alternatives
+        if proposable and self._shadow is None:
+            value = float(hypotheses.values[named] + self._assumed_along(named) + change)
+            self.proposals.append(Proposal(name=hypotheses.names[named], value=value))
+            self._shadow = (named, change, variance, 0.0)
+            self._shadow_from, self._shadow_errors = self.metres, (0.0, 0.0)
+        elif not proposable and not alarm.alternatives and self.metres - self._told_at > _SETTLED:
+            self._adopt(named, change, variance)
+        del now
+        return [alarm]
+
+    def _alarm_of(self, verdict: _Verdict, since: Moment) -> Alarm:
+        best, hypotheses, now = verdict.best, self.hypotheses, self._blocks[-1].since
+        name, kind = hypotheses.names[best], hypotheses.kinds[best]
+        value = float(hypotheses.values[best] + self._assumed_along(best) + verdict.change[best])
+        reach = 1.96 * float(verdict.deviation[best])
+        if kind == "change" and name.startswith("radius_"):
+            share = float(verdict.change[best]) / hypotheses.values[best]
+            if abs(share) > _STRONG:  # a tyre does not change so much
+                kind, name = "fault", ("encoder_" if share > 0 else "slip_") + name.removeprefix("radius_")
+        near = np.argsort(-verdict.h)
+        others = [int(j) for j in near if j != best and verdict.h[j] > verdict.h[best] - _APART]
+        return Alarm(
+            kind=kind,
+            name=name,
+            value=value,
+            low=value - reach,
+            high=value + reach,
+            unit=hypotheses.units[best],
+            trajectory=now.trajectory,
+            t=now.t,
+            since=since.trajectory,
+            since_t=since.t,
+            detected_after_m=max(self.metres - since.metres, 0.0),
+            alternatives=tuple(hypotheses.names[j] for j in others),
+            advice=self._advice(best, others, verdict) if others else "",
+        )
+
+    def _advice(self, best: int, others: Sequence[int], verdict: _Verdict) -> str:
+        """The motion in which the hypotheses differ most, as an imperative."""
+        size = self.calibration.matrix_array.size
+        motions = self.calibration.robot.motions
+        signals = np.linalg.pinv(self.calibration.robot.centre_matrix) @ motions.T
+        differences = []
+        for other in others:
+            change = (
+                self.hypotheses.directions[:size, best] * verdict.change[best]
+                - self.hypotheses.directions[:size, other] * verdict.change[other]
+            )
+            moved = change.reshape(3, -1) @ signals
+            moved[2] *= max(self.predictor.reach, 0.1)
+            differences.append(np.linalg.norm(moved, axis=0) / np.maximum(np.linalg.norm(motions[:, :2], axis=1), 0.1))
+        if not np.max(differences) > 0:
+            return "no motion tells them apart"
+        motion = motions[int(np.min(differences, axis=0).argmax())]
+        return (
+            "turn on the spot"
+            if abs(motion[2]) > 1e-6
+            else "drive sideways"
+            if abs(motion[1]) > 0.5
+            else "drive straight"
+        )
+
+    def _weigh(self, block: _Sums, verdict: _Verdict) -> None:
+        """Judge what is in shadow, and what was accepted, by a new block."""
+        level = math.log(len(self.proposals) * (len(self.proposals) + 1) / _ALPHA) if self.proposals else 0.0
+        if self._shadow is not None:
+            named, change, variance, evidence = self._shadow
+            ratio = float(verdict.ratio[named])
+            gain = change * float(block.b[named]) - change**2 * float(block.a[named]) / 2
+            evidence += gain / ratio
+            before, after = self._shadow_errors
+            before += float(block.scatter[named])
+            after += float((block.b[named] - change * block.a[named]) ** 2 / max(block.a[named], 1e-12))
+            self._shadow_errors = before, after
+            self._shadow = (named, change, variance, evidence)
+            other = verdict.best
+            ousted = other != named and verdict.h[other] > verdict.h[named] + _APART
+            if evidence > level or evidence < -level or ousted:
+                accepted = evidence > level
+                reason = "predicts later motion better" if accepted else "predicts later motion worse"
+                if ousted and not accepted:
+                    reason = f"{self.hypotheses.names[other]} explains it better"
+                self._note(accepted=accepted, reason=reason)
+                if accepted:
+                    refined, deviation = float(verdict.change[named]), float(verdict.deviation[named])
+                    self.proposals[-1] = self.proposals[-1].model_copy(
+                        update={"value": float(self.hypotheses.values[named] + self._assumed_along(named) + refined)}
+                    )
+                    self._adopt(named, refined, deviation**2)
+                    self._kept = (named, refined, 0.0)
+                else:
+                    self._shadow = None
+            else:
+                self._note(accepted=None, reason="")
+        elif self._kept is not None:
+            named, change, evidence = self._kept
+            evidence += (-change * float(block.b[named]) - change**2 * float(block.a[named]) / 2) / float(
+                verdict.ratio[named]
+            )
+            self._kept = (named, change, evidence)
+            if evidence > level:
+                self.proposals[-1] = self.proposals[-1].model_copy(
+                    update={"rolled_back": True, "reason": "predicts later motion worse after all"}
+                )
+                self._adopt(named, -change, 0.0)
+                self._kept = None
+
+    def _note(self, *, accepted: bool | None, reason: str) -> None:
+        """Write down how the proposal in shadow does."""
+        assert self._shadow is not None
+        before, after = self._shadow_errors
+        held_out = HeldOut(
+            metres=self.metres - self._shadow_from,
+            log_e=self._shadow[3],
+            error_ratio=math.sqrt(after / before) if before > 0 else None,
+        )
+        self.proposals[-1] = self.proposals[-1].model_copy(
+            update={"accepted": accepted, "reason": reason, "held_out": held_out}
+        )
+
+    def _adopt(self, named: int, change: float, variance: float) -> None:
+        """Go on from a change: what comes is compared with it, as sure as its value is."""
+        direction = self.hypotheses.directions[:, named]
+        self._assumed = self._assumed + change * direction
+        self._adopted[named] = self._adopted.get(named, 0.0) + change
+        self._state = self._state + self._deviation @ (change * direction)
+        if self.hypotheses.names[named] == "reference_clock":
+            self._delay += change
+            self._state[3] += change
+        self._untold = self._untold + variance * direction[:, None] * direction
+        verdict = self._verdict()
+        self._usual_ratio = verdict.ratio
+        self._freedom = np.minimum(self._freedom + sum(block.count for block in self._blocks), _LONGEST_MEMORY)
+        self._blocks.clear()
+        self._recent.clear()
+        self._alarm, self._shadow = None, None
+
+    def _assumed_along(self, named: int) -> float:
+        """The part of what was adopted that is this hypothesis's, in its unit."""
+        return self._adopted.get(named, 0.0)
+
+
+def _scatter_within(a: Array, b: Array, within: Array, groups: Array) -> tuple[Array, Array]:
+    """Scatter (G + 1, P) of the first blocks' estimates about their mean, and its degrees of freedom (G + 1,)."""
+    none = np.zeros((1, a.shape[1]))
+    sums = [np.concatenate([none, np.cumsum(rows, axis=0)]) for rows in (a, b, within)]
+    squares = np.maximum(sums[2] - sums[1] ** 2 / np.maximum(sums[0], 1e-12), 0.0)
+    return squares, np.maximum(np.concatenate([[0.0], np.cumsum(groups)]) - 1, 0.0)
