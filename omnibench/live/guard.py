@@ -41,6 +41,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -78,12 +79,19 @@ _MEDIAN: Final = 2.366  # of chi-square with 3 degrees of freedom
 _LEAST_PLACE: Final = 1e-4  # m, standard deviation of a reference's position; chosen
 _LEAST_HEADING: Final = 1e-4  # rad, of its heading; chosen
 _WRONG_SPEED: Final = 1.0  # m/s, least speed that tells a jump of the reference from a push; chosen
-_SAME_BURST: Final = 5.0  # s within which bursts are one; chosen
-_PASSING: Final = ("burst", "reference")
+_SURE: Final = 3.0  # times the threshold: so large a step is no change, however well that explains it; chosen
+_PARTLY: Final = 0.6  # share of what a step explains: a change that explains as much may be it; chosen
+_MOSTLY: Final = 0.8  # share of a step that the motion of one wheel explains; chosen
+_CAREFUL: Final = 3.0  # times the threshold of a step while a change is settled; chosen
+_PERSISTENT: Final = 5  # steps of one wheel that are no burst any more; chosen
+_SAME_BURST: Final = 6.0  # s within which bursts are one; chosen
+_FIRST_TOLD: Final = ("trajectory", "t", "since", "since_t", "detected_after_m")  # fields that an alarm keeps
+_PASSING: Final = ("push", "slip", "reference_jump", "encoder_")
 _SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual; chosen
 _LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change; chosen
 _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
 _LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
+_LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too; chosen
 _SCALES: Final = (1, 4, 16)  # blocks that Birge's ratio joins, as slip may last; chosen
 
 Kind = Literal["change", "fault", "burst", "reference"]
@@ -93,8 +101,7 @@ Kind = Literal["change", "fault", "burst", "reference"]
 class Hypotheses:
     """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of what it is named after.
 
-    values (P,): the calibration's. kinds, units: of each. wheels: plain wheels whose encoder may stand still, with
-    their columns of the matrix. largest (P,): changes that are believed. untold (q, q): covariance P of Eq. (G3).
+    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. untold (q, q): covariance P of Eq. (G3).
     """
 
     names: tuple[str, ...]
@@ -102,7 +109,6 @@ class Hypotheses:
     units: tuple[str, ...]
     values: Array
     directions: Array
-    wheels: tuple[int, ...]
     largest: Array
     untold: Array
 
@@ -111,8 +117,7 @@ class Hypotheses:
         """The hypotheses on the robot of a calibration."""
         robot, matrix = calibration.robot, calibration.matrix_array
         size = matrix.size
-        wheels = tuple(range(len(robot.wheel_names))) if robot.drive.direct else ()
-        count = size + len(wheels) + 1
+        count = size + 1
         rows: list[tuple[str, Kind, str, float, Array]] = []
         changes = directions_of(robot)
         try:
@@ -125,23 +130,21 @@ class Hypotheses:
         rows.append(("floor", "change", "1", 1.0, floor))
         scale = (matrix * np.array([[1.0], [1.0], [0.0]])).ravel()
         rows.append(("reference_scale", "reference", "1", 1.0, scale))
-        directions = np.zeros((count, len(rows) + len(wheels) + 1))
+        directions = np.zeros((count, len(rows) + 1))
         directions[:size, : len(rows)] = np.column_stack([row[4] for row in rows])
-        directions[size:, len(rows) :] = np.eye(len(wheels) + 1)
-        encoders = [f"encoder_{robot.wheel_names[wheel]}" for wheel in wheels]
+        directions[-1, -1] = 1.0
         untold = np.zeros((count, count))
         if calibration.covariance is None:
             untold[:size, :size] = np.diag(np.repeat((_UNSTATED * robot.row_scales) ** 2, matrix.shape[1]))
         else:
             untold[:size, :size] = np.array(calibration.covariance)[:size, :size]
         return cls(
-            (*(row[0] for row in rows), *encoders, "reference_clock"),
-            (*(row[1] for row in rows), *["fault"] * len(encoders), "reference"),
-            (*(row[2] for row in rows), *["1"] * len(encoders), "s"),
-            np.array([*(row[3] for row in rows), *[1.0] * len(encoders), 0.0]),
+            (*(row[0] for row in rows), "reference_clock"),
+            (*(row[1] for row in rows), "reference"),
+            (*(row[2] for row in rows), "s"),
+            np.array([*(row[3] for row in rows), 0.0]),
             directions,
-            wheels,
-            np.array([*(_LARGEST_SHARE * _size(row) for row in rows), *[2.0] * len(encoders), 3.0]),
+            np.array([*(_LARGEST_SHARE * _size(row) for row in rows), 3.0]),
             untold,
         )
 
@@ -157,7 +160,7 @@ class Stretch:
 
     moved (3,): m, m, rad. slopes (3, q): its derivatives G. spread (3, 3): covariance that slip adds. rolled: m that
     the wheels rolled in the mean. way: m that the tracked point went. seconds. begun, velocity (3,): at its begin and end, in the frame of its begin, m/s,
-    m/s, rad/s.
+    m/s, rad/s. still: wheels whose encoders stood still while others turned.
     """
 
     moved: Array
@@ -168,17 +171,19 @@ class Stretch:
     seconds: float
     begun: Array
     velocity: Array
+    still: tuple[int, ...]
 
 
 class Predictor:
     """Makes stretches of wheel samples, by a calibration's noise and geometry."""
 
-    def __init__(self, calibration: Calibration, hypotheses: Hypotheses) -> None:
+    def __init__(self, calibration: Calibration) -> None:
         robot, noise, slip = calibration.robot, calibration.noise or UNKNOWN_NOISE, calibration.slip
         self._robot = robot
         self._arc = calibration.integration == "arc"
         self.reach, self._matrix, self._radii = robot.reach, calibration.matrix_array, robot.radii
-        self._wheels = hypotheses.wheels
+        counts = [1] if isinstance(robot.drive, CarDrive) else [1 + wheel.has_steering for wheel in robot.measured]
+        self.columns = np.cumsum([0, *counts[:-1]])  # first column of each wheel
         # Contacts slip independently, as much as turns the robot as its training runs were turned.
         turning = math.sqrt(float(np.square(self._matrix[2] / self._of_wheel(self._radii)).sum()))
         self._by_metre = slip is not None
@@ -192,8 +197,7 @@ class Predictor:
             return values
         if isinstance(self._robot.drive, CarDrive):
             return np.repeat(values.mean(axis=-1, keepdims=True), signals, axis=-1)
-        counts = [2 if wheel.has_steering else 1 for wheel in self._robot.measured]
-        return np.repeat(values, counts, axis=-1)
+        return np.repeat(values, [1 + wheel.has_steering for wheel in self._robot.measured], axis=-1)
 
     def stretch(self, moved: Array, driven: Array, seconds: Array) -> Stretch:
         """The stretch of n samples: motions (n, 3), integrals (n, M) of the drive signals, durations (n,), s."""
@@ -205,19 +209,13 @@ class Predictor:
         end = after[-1]
         lever = end - after + steps / 2  # from the middle of each sample to the end
         by_place, by_turn = unit @ driven, (1j * lever) @ driven
-        count, signals = len(self._wheels), driven.shape[1]
-        slopes = np.zeros((3, 3 * signals + count + 1))
+        signals = driven.shape[1]
+        slopes = np.zeros((3, 3 * signals + 1))
         by_row = slopes[:, : 3 * signals].reshape(3, 3, signals)
         by_row[0] = by_place.real, -by_place.imag, by_turn.real
         by_row[1] = by_place.imag, by_place.real, by_turn.imag
-        by_row[2, 2] = total = driven.sum(axis=0)
+        by_row[2, 2] = driven.sum(axis=0)
         rolled = np.hypot(moved[:, 0], moved[:, 1]) + self.reach * np.abs(turn)
-        if count:  # an encoder that stands still while the others turn hides about as much
-            angles = np.abs(driven).sum(axis=0) * self._radii
-            for place, wheel in enumerate(self._wheels):
-                if angles[wheel] < _NO_ANGLE and (others := angles.sum() / (count - 1)) > _LEAST_STEP:
-                    hidden = np.array([[self._matrix[0, wheel]], [self._matrix[1, wheel]], [self._matrix[2, wheel]]])
-                    slopes[:, 3 * signals + place] = (hidden * others / self._radii[wheel])[:, 0]
         # Slip of each contact, and half as much of the place in all directions.
         metres = np.abs(driven) * self._of_wheel(self._radii) if self._by_metre else np.repeat(seconds[:, None], signals, 1)
         metres[rolled <= 0] = 0.0
@@ -237,7 +235,11 @@ class Predictor:
         )
         whole = np.array([end.real, end.imag, turn.sum()])
         way = float(np.abs(steps).sum())
-        return Stretch(whole, slopes, spread, float(rolled.sum()), way, duration, begun, velocity)
+        metres = np.add.reduceat(np.abs(driven).sum(axis=0) * self._of_wheel(self._radii), self.columns)
+        still: tuple[int, ...] = ()
+        if metres.max() > _LEAST_STEP and metres.min() < _NO_ANGLE:
+            still = tuple(np.flatnonzero(metres < _NO_ANGLE).tolist())
+        return Stretch(whole, slopes, spread, float(rolled.sum()), way, duration, begun, velocity, still)
 
 
 class Alarm(Model):
@@ -312,6 +314,15 @@ class _Sums:
 
 
 @dataclass(frozen=True, eq=False)
+class _Recent:
+    """A stretch that is not in a block yet: its sums, s, and the wheels whose encoders stood still."""
+
+    sums: _Sums
+    seconds: float
+    still: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class _Verdict:
     """The best hypothesis over onsets: h (P,), changes and deviations (P,), Birge's ratios (P,), and the first block."""
 
@@ -335,7 +346,7 @@ class Guard:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self.hypotheses = Hypotheses.of(calibration)
-        self.predictor = Predictor(calibration, self.hypotheses)
+        self.predictor = Predictor(calibration)
         noise = calibration.noise or UNKNOWN_NOISE
         place = max(noise.pose_position, _LEAST_PLACE)
         self._usual = pose_covariance(place, math.degrees(max(noise.pose_heading, _LEAST_HEADING)))
@@ -351,7 +362,7 @@ class Guard:
         self._adopted: dict[int, float] = {}  # hypothesis -> change
         self._blocks: list[_Sums] = []
         self._block: _Sums | None = None
-        self._recent: deque[tuple[_Sums, Array, float]] = deque()
+        self._recent: deque[_Recent] = deque()
         self._squares: list[float] = []
         self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
         self._usual_ratio = np.ones(len(self.hypotheses.names))
@@ -361,12 +372,14 @@ class Guard:
         self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
         self._kept: tuple[int, float, float] | None = None  # accepted: hypothesis, change, log of e of the old value
         self._ratio = 1.0
-        self._last_burst = -math.inf
+        self._last_step, self._quiet = -math.inf, 0
+        self._steps_of: dict[int, int] = {}  # wheel -> steps in a row that are its own
         self._begun = False
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
         """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""
         self._flush()
+        self._quiet = 0
         if self._begun:  # delays that differ from run to run are no change of the reference
             self._delays.append(float(self._state[3]))
             spread = np.square(np.array(self._delays) - np.mean(self._delays)).sum() + _RUNS * _DELAY**2
@@ -383,6 +396,7 @@ class Guard:
         self._deviation = np.zeros((5, len(self._assumed)))  # B of Eq. (G1)
         self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._faster = np.zeros((3, 3))
+        self._steady = self._state[3:].copy(), self._covariance[3:, 3:].copy()
         self._begun = False
 
     def take(
@@ -393,7 +407,7 @@ class Guard:
         at: name of the run and time in it, s. covariance: as of ``begin``.
         """
         self.metres, self.seconds = self.metres + stretch.way, self.seconds + stretch.seconds
-        speed = stretch.rolled / max(stretch.seconds, 1e-9)
+        speed = stretch.way / max(stretch.seconds, 1e-9)
         self._fastest = max(self._fastest, speed)
         # Predict, Eq. (G1).
         state, heading = self._state, float(self._state[2])
@@ -440,7 +454,7 @@ class Guard:
         gain = weight * self._covariance @ measured.T @ information
         slope = measured @ self._deviation
         slope[:, -1] -= velocity
-        told = slope.T @ information
+        told = slope.T @ information * (not stretch.still)
         along = slope @ self.hypotheses.directions
         told_along = along.T @ information
         whole = told @ slope
@@ -454,7 +468,9 @@ class Guard:
             stretch.rolled,
             now,
         )
-        self._recent.append((sums, stretch.seconds, weight))
+        self._recent.append(_Recent(sums, stretch.seconds, stretch.still))
+        if self._quiet and len(self._recent) > _RECENT:
+            self._recent.popleft()
         of_steps = measured @ self._steps
         self._step_a += np.swapaxes(of_steps, 1, 2) @ information @ of_steps
         self._step_b += np.swapaxes(of_steps, 1, 2) @ (information @ innovation)
@@ -462,56 +478,58 @@ class Guard:
         self._covariance -= gain @ measured @ self._covariance
         self._deviation -= gain @ slope
         self._steps = self._steps - gain @ of_steps
-        burst = self._find_step(now)
-        if burst is not None:
-            return burst
+        step = self._find_step(now, pose, self._scale * noise)
+        if step is not None:
+            return step
+        if self._quiet:
+            self._quiet = _RECENT if stretch.still else self._quiet - 1
+            if not self._quiet:
+                self._anchor(pose, self._scale * noise)
+                self._recent.clear()
+                self._steps_of.clear()
+            return []
         # What is older than any step enters the block.
         if len(self._recent) > _RECENT:
             return self._enter()
         return []
 
-    def _find_step(self, now: Moment) -> list[Alarm] | None:
-        """Tell a step of the pose at one of the last stretches, where it explains them better than any change."""
-        tail = max(self._tail, self._ratio)
+    def _find_step(self, now: Moment, pose: Array, noise: Array) -> list[Alarm] | None:
+        """Tell a step of the pose at one of the last stretches, where it explains them better than any change.
+
+        The filter begins again at the pose, and nothing enters a block until it is sure that the step is over.
+        """
+        tail = max(self._tail, self._ratio) * (1.0 if self._alarm is None else _CAREFUL)
         regular = self._step_a + 1e-9 * np.eye(3)
         steps = np.linalg.solve(regular, self._step_b[:, :, None])[:, :, 0]
         gains = np.einsum("ij,ij->i", self._step_b, steps) / (2 * tail)
         at = int(gains.argmax())
-        if gains[at] <= THRESHOLD:
+        gain, step, reach = float(gains[at]), steps[at], max(self.predictor.reach, 0.1)
+        size, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
+        if gain <= THRESHOLD or max(size, turned * reach) < _LEAST_STEP:
             return None
-        # Changes since any of these stretches, with or without the block before them.
-        parts = [sums for sums, _, _ in self._recent]
-        b = np.cumsum([part.b for part in reversed(parts)], axis=0)
-        a = np.cumsum([part.a for part in reversed(parts)], axis=0)
-        rival = (b * b / (2 * tail * np.maximum(a, 1e-12))).max()
-        if rival > gains[at] - _APART:
+        # Changes since any of these stretches.
+        b, a = (np.cumsum([getattr(part.sums, name) for part in reversed(self._recent)], axis=0) for name in "ba")
+        rival = float((b * b / (2 * tail * np.maximum(a, 1e-12))).max())
+        if rival > gain - _APART or (gain < _SURE * THRESHOLD and rival > _PARTLY * gain):
             return None
-        step = steps[at]
-        if max(math.hypot(step[0], step[1]), abs(float(step[2])) * max(self.predictor.reach, 0.1)) < _LEAST_STEP:
-            return None
-        dropped = len(self._steps) - at
-        seconds = sum(self._recent[-k][1] for k in range(1, min(dropped, len(self._recent)) + 1)) / max(dropped, 1)
-        rolled = sum(self._recent[-k][0].rolled for k in range(1, min(dropped, len(self._recent)) + 1))
-        since = self._recent[-min(dropped, len(self._recent))][0].since
-        self._state += self._steps[at] @ step
-        spread = np.linalg.inv(regular[at])
-        self._covariance += self._steps[at] @ spread @ self._steps[at].T
-        for _ in range(min(dropped, len(self._recent))):
-            self._recent.pop()
-        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
-        size = math.hypot(step[0], step[1])
-        again = self._last_burst > self.seconds - _SAME_BURST and self.alarms and self.alarms[-1].kind in _PASSING
-        self._last_burst = self.seconds
-        jumped = not again and size / max(seconds, 1e-9) > max(_WRONG_SPEED, 2 * self._fastest)
-        turned = abs(float(step[2]))
-        value, unit = (size, "m") if size > turned * max(self.predictor.reach, 0.1) else (turned, "rad")
-        name = "reference_jump" if jumped else "push" if rolled < size / 2 else "slip"
-        if again:
-            value = value + (self.alarms[-1].value or 0.0) if unit == self.alarms[-1].unit else value
-            name = "push" if self.alarms[-1].name == "reference_jump" else self.alarms[-1].name
-            since = Moment(self.alarms[-1].since, self.alarms[-1].since_t, since.metres)
+        parts = list(self._recent)[at - len(self._steps) :]
+        name, kind = self._name_step(parts, regular[at], self._step_b[at], gain * tail, size)
+        since = parts[0].sums.since
+        self._anchor(pose, noise)
+        self._recent.clear()
+        self._quiet = _RECENT
+        value, unit = (size, "m") if size > turned * reach else (turned, "rad")
+        before = self.alarms[-1] if self.alarms and self.seconds - self._last_step < _SAME_BURST else None
+        self._last_step = self.seconds
+        if before is not None and before.name.startswith(_PASSING):  # it goes on
+            began = Moment(before.since, before.since_t, now.metres - before.detected_after_m)
+            value += (before.value or 0.0) if unit == before.unit else 0.0
+            if before.kind != "reference" and kind != "fault":
+                name, kind = before.name, before.kind
+            elif before.kind == "reference" and kind == "reference":
+                name, kind = "push", "burst"
+            since = began
             self.alarms.pop()
-        kind: Kind = "reference" if name == "reference_jump" else "burst"
         alarm = Alarm(
             kind=kind,
             name=name,
@@ -526,9 +544,45 @@ class Guard:
         self.alarms.append(alarm)
         return [alarm]
 
+    def _name_step(self, parts: Sequence[_Recent], a: Array, b: Array, gain: float, size: float) -> tuple[str, Kind]:
+        """The name of a step in these stretches, of this size, m, that explains this much of them."""
+        matrix, turn = self.calibration.matrix_array, rotation(float(self._state[2]))
+        edges = [*self.predictor.columns.tolist(), matrix.shape[1]]
+        explained = []
+        for low, high in pairwise(edges):
+            along = turn @ matrix[:, low:high]
+            score = along.T @ b
+            explained.append(float(score @ np.linalg.lstsq(along.T @ a @ along, score)[0]) / 2)
+        wheel = int(np.argmax(explained))
+        name = self.calibration.robot.wheel_names[wheel]
+        if explained[wheel] > _MOSTLY * gain:
+            if any(wheel in part.still for part in parts):
+                return f"encoder_{name}", "fault"
+            self._steps_of[wheel] = self._steps_of.get(wheel, 0) + 1
+            if self._steps_of[wheel] > _PERSISTENT:
+                return f"slip_{name}", "fault"
+        else:
+            self._steps_of.clear()
+        seconds = float(np.mean([part.seconds for part in parts]))
+        if size / max(seconds, 1e-9) > max(_WRONG_SPEED, 1.5 * self._fastest):
+            return "reference_jump", "reference"
+        return "push" if sum(part.sums.rolled for part in parts) < size / 2 else "slip", "burst"
+
+    def _anchor(self, pose: Array, noise: Array) -> None:
+        """Begin the filter again at a measured pose, with the delay and the offset as they were before the step."""
+        self._state[3:], self._covariance[3:, 3:] = self._steady
+        self._state[:3] = pose
+        self._state[2] -= self._state[4]
+        self._covariance[:3, 3:] = self._covariance[3:, :3] = 0.0
+        self._covariance[:3, :3] = noise
+        self._covariance[2, 2] += (variance := float(self._covariance[4, 4]))
+        self._covariance[2, 4] = self._covariance[4, 2] = -variance
+        self._deviation[:] = 0.0
+        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+
     def _enter(self) -> list[Alarm]:
         """Add the oldest stretch to the block, which is judged when it is long enough."""
-        sums, _, _ = self._recent.popleft()
+        sums = self._recent.popleft().sums
         sums.b = self.hypotheses.directions.T @ sums.score
         if self._block is None:
             self._block = sums
@@ -546,6 +600,7 @@ class Guard:
     def _judge(self) -> list[Alarm]:
         """Close the block; judge all of them, the alarm that is open, and what is in shadow."""
         block, self._block = self._block, None
+        self._steady = self._state[3:].copy(), self._covariance[3:, 3:].copy()
         assert block is not None
         block.scatter = block.b**2 / np.maximum(block.a, 1e-12)
         self._blocks.append(block)
@@ -571,7 +626,7 @@ class Guard:
         a, b, scatter = (np.array([getattr(block, name) for block in self._blocks]) for name in ("a", "b", "scatter"))
         numbers = np.array([block.count for block in self._blocks])
         firsts = list(range(count))
-        ratios = np.ones((len(firsts), a.shape[1]))
+        ratios = np.full((len(firsts), a.shape[1]), _LEAST_RATIO)
         freedom = self._freedom + max(int(numbers.sum()) - 2, 0)
         for scale in _SCALES:
             places = (np.cumsum(numbers) - numbers) // scale
@@ -622,7 +677,7 @@ class Guard:
             alarm = self._alarm_of(verdict, since)
             if told:
                 first = self.alarms[self._open_at]
-                kept = {name: getattr(first, name) for name in ("trajectory", "t", "detected_after_m")}
+                kept = {name: getattr(first, name) for name in _FIRST_TOLD}
                 changed = alarm.model_copy(update=kept)
                 self.alarms[self._open_at] = alarm = changed
             else:

@@ -214,6 +214,41 @@ def watched(guard: Guard, drive: Drive, rng: np.random.Generator, slam: Array | 
         yield guard.metres
 
 
+# What befalls a robot for once -> names that tell it.
+EVENTS = {
+    "push": ("push", "slip"),
+    "edge": ("slip", "push"),
+    "jump": ("reference_jump",),
+    "encoder": ("encoder",),
+    "scale": ("reference_scale",),
+}
+
+
+def befallen(drive: Drive, what: str, start: int, rng: np.random.Generator) -> tuple[Drive, Array]:
+    """A drive that something befell at a step, and the poses that the reference then reports, without noise."""
+    poses, signals = drive.poses.copy(), drive.signals.copy()
+    if what in ("push", "edge", "jump"):
+        # Pushed by 10 cm to a side in half a second; held back by 8 cm and 3 degrees at an edge; put right by SLAM.
+        sideways = {"push": math.pi / 2, "edge": math.pi, "jump": rng.uniform(0, math.tau)}[what]
+        angle = poses[start, 2] + sideways
+        count, way, turn = {"push": (10, 0.1, 0.0), "edge": (10, 0.08, 3.0), "jump": (1, 0.4, 5.0)}[what]
+        turn = math.radians(turn)
+        share = np.clip((np.arange(len(poses)) - start) / count, 0, 1)
+        pivot = poses[start, :2].copy()
+        turned = poses[:, :2] - pivot
+        angles = share * turn
+        x = turned[:, 0] * np.cos(angles) - turned[:, 1] * np.sin(angles)
+        y = turned[:, 0] * np.sin(angles) + turned[:, 1] * np.cos(angles)
+        poses = np.column_stack(
+            [pivot[0] + x + share * way * math.cos(angle), pivot[1] + y + share * way * math.sin(angle), poses[:, 2] + angles]
+        )
+    elif what == "encoder":  # silent for 4 s
+        signals[start : start + 80, 0] = 0.0
+    elif what == "scale":
+        poses[start:, :2] = poses[start, :2] + 1.01 * (poses[start:, :2] - poses[start, :2])
+    return replace(drive, signals=signals), poses
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
@@ -226,6 +261,7 @@ def main() -> None:
     for kind in options.classes:
         rng = np.random.default_rng([options.seed, len(kind)])
         results: dict[tuple[str, float], list[tuple[bool, float, str]]] = defaultdict(list)
+        events: dict[str, list[tuple[bool, str]]] = defaultdict(list)
         false: Counter[str] = Counter()
         hours, spent, stretches = 0.0, 0.0, 0
         for _ in range(options.robots):
@@ -257,6 +293,19 @@ def main() -> None:
                 right = alarm is not None and alarm.name == what and not alarm.alternatives
                 name = "none" if alarm is None else alarm.name + ("?" if alarm.alternatives else "")
                 results[what.partition("_")[0], share].append((right, alarm.detected_after_m if alarm else math.inf, name))
+            for what in EVENTS:
+                if what == "encoder" and kind == "swerve":
+                    continue
+                drive = driven(truth, commands(kind, 300.0, rng), rng)
+                start = 2000 + int(np.argmax(np.abs(drive.signals[2000:, 0]) > 4.0))
+                changed, slam = befallen(drive, what, start, rng)
+                guard, began = Guard(calibration), None
+                for number, metres in enumerate(watched(guard, changed, rng, slam), 1):
+                    began = metres if number * POSE <= start * STEP else began
+                told = [alarm.name for alarm in guard.alarms]
+                right = bool(told) and all(name.startswith(EVENTS[what]) for name in told)
+                wrongly = [each.name for each in guard.proposals if each.accepted]
+                events[what].append((right and not wrongly, ",".join(told) + (f" accepted {wrongly}" if wrongly else "")))
             clock = time.process_time()
             per_robot = options.false_hours * 3600 / options.robots
             drive = driven(truth, commands(kind, per_robot, rng), rng)
@@ -272,6 +321,9 @@ def main() -> None:
             delay = np.median([row[1] for row in rows])
             wrong = Counter(row[2] for row in rows if not row[0])
             print(f"{kind:13} {what} {share:+.1%}: named {right:.0%} of {len(rows)}, median after {delay:.1f} m; {dict(wrong)}")
+        for what, told_of in events.items():
+            wrong = Counter(row[1] for row in told_of if not row[0])
+            print(f"{kind:13} {what}: told as such {np.mean([row[0] for row in told_of]):.0%} of {len(told_of)}; {dict(wrong)}")
         print(f"{kind:13} false alarms in {hours:.1f} h: {sum(false.values())} {dict(false)}; {1e6 * spent / stretches:.0f} us a pose")
         sys.stdout.flush()
 
