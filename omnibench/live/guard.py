@@ -58,12 +58,17 @@ _ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of an
 _LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years; chosen
 THRESHOLD: Final = math.log(_LOOKS / _ALPHA)  # of h, Eq. (G4)
 _APART: Final = math.log(20.0)  # of h between a name and its alternatives; chosen, as 95 %
-_STATED: Final = 12.0  # n0 of Eq. (G4); chosen
+_STATED: Final = 12.0  # n0 of Eq. (G4) where the calibration does not say of how many runs it speaks; chosen
+_LEAST_STATED: Final = 3.0  # n0, of few runs or of long-lasting slip; chosen
 _METRES: Final = 1.0  # that the wheels roll in a block; chosen, as slip decorrelates within 2 m
+_WANDERING: Final = 0.25  # share of what the calibration does not know that differs from path to path; chosen
 _ALIKE: Final = 6  # blocks of a length, beyond which the two oldest become one of twice the length; chosen
 _RECENT: Final = 8  # stretches at which a step is looked for, and which are not yet in a block; chosen
 _DELAY: Final = 0.1  # s, standard deviation of the delay of a reference's stamps when a run begins; chosen
 _LASTING: Final = 0.8  # share of that after another stretch; chosen
+_FASTER: Final = 0.02  # m/s, a change of velocity that a delay shows at; chosen
+_ASIDE: Final = 0.3  # share of a step that is not along the velocity before; chosen
+_LATEST: Final = 2.0  # s: no reference is later; chosen
 _RUNS: Final = 2.0  # runs for which that counts; chosen
 _OFFSET: Final = 0.003  # rad, least standard deviation of a reference's heading offset in a run; chosen
 _STRONG: Final = 0.04  # share of a radius: no tyre changes by more, but a wheel slips or its encoder errs; chosen
@@ -92,7 +97,7 @@ _LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outliv
 _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
 _LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
 _LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too; chosen
-_SCALES: Final = (1, 4, 16)  # blocks that Birge's ratio joins, as slip may last; chosen
+_SCALES: Final = (1, 4, 16, 64)  # blocks that Birge's ratio joins, as slip may last; chosen
 
 Kind = Literal["change", "fault", "burst", "reference"]
 
@@ -366,13 +371,14 @@ class Guard:
         self._squares: list[float] = []
         self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
         self._usual_ratio = np.ones(len(self.hypotheses.names))
-        told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _STATED), _LONGEST_MEMORY)
+        told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _LEAST_STATED), _LONGEST_MEMORY)
         self._freedom = np.full(len(self.hypotheses.names), float(told))
         self._alarm: int | None = None  # hypothesis of the alarm that is open
         self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
         self._kept: tuple[int, float, float] | None = None  # accepted: hypothesis, change, log of e of the old value
         self._ratio = 1.0
         self._last_step, self._quiet = -math.inf, 0
+        self._last_changed, self._changed_at = np.zeros(3), -math.inf
         self._steps_of: dict[int, int] = {}  # wheel -> steps in a row that are its own
         self._begun = False
 
@@ -382,9 +388,7 @@ class Guard:
         self._quiet = 0
         if self._begun:  # delays that differ from run to run are no change of the reference
             self._delays.append(float(self._state[3]))
-            spread = np.square(np.array(self._delays) - np.mean(self._delays)).sum() + _RUNS * _DELAY**2
-            self._delay_variance = float(spread) / (_RUNS + len(self._delays))
-            self._untold[-1, -1] = self._delay_variance
+            self._spread_of_delays()
         self._state = np.array([*pose.tolist(), self._delay, 0.0])
         self._covariance = np.zeros((5, 5))
         self._covariance[:3, :3] = self._usual if covariance is None else covariance
@@ -441,7 +445,10 @@ class Guard:
         noise = self._usual if covariance is None else covariance
         faster = turn @ (stretch.velocity - stretch.begun)  # a delay shows while the velocity changes, in part
         spread = measured @ self._covariance @ measured.T + self._scale * noise
+        self._moving = speed > _FASTER
         self._faster = _LASTING * self._faster + faster[:, None] * faster
+        if np.hypot(faster[0], faster[1]) > _FASTER and self._fastest > 0:
+            self._last_changed, self._changed_at = faster, self.seconds
         spread += self._delay_variance * self._faster
         information = np.linalg.inv(spread)
         square = float(innovation @ information @ innovation)
@@ -507,6 +514,10 @@ class Guard:
         size, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
         if gain <= THRESHOLD or max(size, turned * reach) < _LEAST_STEP:
             return None
+        if self._is_late(step):
+            self._anchor(pose, noise)
+            self._recent.clear()
+            return []
         # Changes since any of these stretches.
         b, a = (np.cumsum([getattr(part.sums, name) for part in reversed(self._recent)], axis=0) for name in "ba")
         rival = float((b * b / (2 * tail * np.maximum(a, 1e-12))).max())
@@ -543,6 +554,24 @@ class Guard:
         )
         self.alarms.append(alarm)
         return [alarm]
+
+    def _is_late(self, step: Array) -> bool:
+        """True if a step is the rest of the way that the reference is late by, after the velocity changed."""
+        changed = self._last_changed
+        if self.seconds - self._changed_at > _LATEST or self._moving or not np.any(changed):
+            return False
+        late = float(step @ changed / (changed @ changed))
+        if abs(late) > _LATEST or np.linalg.norm(step - late * changed) > _ASIDE * np.linalg.norm(step):
+            return False
+        self._delays.append(late)
+        self._spread_of_delays()
+        return True
+
+    def _spread_of_delays(self) -> None:
+        """Take delays that differ from run to run for no change of the reference."""
+        spread = np.square(np.array(self._delays) - np.mean(self._delays)).sum() + _RUNS * _DELAY**2
+        self._delay_variance = float(spread) / (_RUNS + len(self._delays))
+        self._untold[-1, -1] = self._delay_variance
 
     def _name_step(self, parts: Sequence[_Recent], a: Array, b: Array, gain: float, size: float) -> tuple[str, Kind]:
         """The name of a step in these stretches, of this size, m, that explains this much of them."""
@@ -640,7 +669,8 @@ class Guard:
                 right = int(np.searchsorted(edges, first))  # groups wholly after, and wholly before
                 left = right if right < len(edges) and edges[right] == first else max(right - 1, 0)
                 squares, free = before[0][left] + after[0][right], before[1][left] + after[1][right]
-                ratio = (self._freedom * self._usual_ratio + squares) / (self._freedom + free)
+                stated = np.maximum(self._freedom / scale, _LEAST_STATED)
+                ratio = (stated * self._usual_ratio + squares) / (stated + free)
                 ratios[row] = np.maximum(ratios[row], ratio)
         # What the blocks before tell of what the calibration does not know, and what is left of it.
         wholes, scores = (
@@ -655,6 +685,7 @@ class Guard:
         score = (scores[-1] - scores[firsts]) / common[:, None]
         mean = (known @ (scores[firsts] / common[:, None])[:, :, None])[:, :, 0]
         score -= (whole @ mean[:, :, None])[:, :, 0]
+        known = known + _WANDERING * (untold - known)
         joint = np.linalg.solve(identity + whole @ known, np.concatenate([whole, score[:, :, None]], axis=2))
         directions = self.hypotheses.directions
         along = np.einsum("qp,fqr,rp->fp", directions, joint[:, :, :-1], directions)
