@@ -1,4 +1,4 @@
-"""``compare``, ``calibrate``, ``evaluate``, ``certify``, ``export`` and ``discover``: a calibration from fit to use."""
+"""``compare``, ``calibrate``, ``evaluate``, ``guard``, ``certify``, ``export``, ``discover``: from fit to use."""
 
 import sys
 from collections.abc import Sequence
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 calibration_app = typer.Typer()
 _PAGE = shared.report_options("Write a page: before and after, paths, parameters, errors by motion.")
+_GUARD_PAGE = shared.report_options("Write a page: alarms, proposals, and the evidence over the way.")
 
 
 @calibration_app.command()
@@ -234,6 +235,42 @@ def evaluate(
     if recordings is not None and evaluation is not None:
         warnings = [*recordings.warnings, *evaluation.warnings, *warnings]
     result = EvaluationResult(evaluation, evaluated, predicted, recordings, calibration, dataset or (), warnings)
+    page.write(result.page, announced=True)
+    show(result, as_json)
+
+
+@calibration_app.command()
+@shared.grouped
+def guard(
+    dataset: list[Path] = shared.DATASETS,
+    calibration: Path = option("Calibration that the robot drives by.", default=..., metavar="FILE"),
+    output: Path | None = output_option("Where to write the calibration with the accepted changes.", metavar="FILE"),
+    page: shared.ReportOptions = _GUARD_PAGE,
+    force: bool = shared.FORCE,
+    plugins: list[Path] | None = shared.PLUGINS,
+    as_json: bool = shared.JSON,
+) -> None:
+    """Say what changed since a calibration, when, and what to do.
+
+    The motion between reference poses is compared with what the calibration predicts, run after run, as a node does
+    while the robot drives: the radius of a wheel, the track, a steering zero, a slipping wheel, a silent encoder, the
+    reference's scale, jumps and clock, the floor.
+    """
+    from omnibench.config import to_yaml
+    from omnibench.live.guard_recording import watch_recording
+    from omnibench.report.guard import GuardResult
+
+    shared.load_given_plugins(plugins)
+    refuse_existing(output, force=force)
+    page.refuse(force=force)
+    with ProgressDisplay() as watch:
+        recordings = omnibench.load_dataset(dataset)
+        report, watching = watch_recording(omnibench.read_calibration(calibration), recordings, watch)
+    proposed = watching.proposed() if output is not None else None
+    if output is not None and proposed is not None:
+        write_text(output, to_yaml(proposed))
+    written = output if proposed is not None else None
+    result = GuardResult(report, watching, recordings.name, recordings.simulated, calibration, dataset, written)
     page.write(result.page, announced=True)
     show(result, as_json)
 

@@ -1,9 +1,9 @@
 """The guard: whether a robot still moves as its calibration says and, where it does not, what has changed.
 
 Between two reference poses the calibration predicts a motion. An extended Kalman filter follows the pose of the tracked
-point (x, y, heading), the delay of the reference's stamps and the offset of its heading; with innovations v of covariance
-S, and C the derivative of a measurement by the state. Let q hold whatever may have changed: elements of the matrix,
-encoders that stand still, the delay. A change by q moves the mean of v by H q,
+point (x, y, heading), the delay of the reference's stamps and the offset of its heading; with innovations v of
+covariance S, and C the derivative of a measurement by the state. Let q hold whatever may have changed: the elements of
+the matrix, and the delay. A change by q moves the mean of v by H q,
 
     B <- F B + G,    H = C B + m,    B <- B - K H,                                                              (G1)
 
@@ -17,14 +17,15 @@ hold all that the innovations tell of q. What the calibration does not know of i
     (A~, b~) = (I + A P)^-1 (A, b),    T = (d' b~)^2 / (d' A~ d)                                                 (G3)
 
 is twice the generalised likelihood ratio of the hypothesis that q changed along d, such as by the radius of one wheel,
-since the first of the blocks (Willsky and Jones, IEEE T-AC 21:108, 1976). A robot that scatters more than its calibration
-states does so from block to block, too: Birge's ratio l (Phys. Rev. 40:207, 1932) of the blocks' estimates of d' q, before
-and after the change, widens S. With n degrees of freedom, n0 of which stand for the calibration's word,
+since the first of the blocks (Willsky and Jones, IEEE T-AC 21:108, 1976). Blocks before it tell of what the calibration
+does not know. A robot that scatters more than its calibration states does so from block to block, too: Birge's ratio l
+(Phys. Rev. 40:207, 1932) of the blocks' estimates of d' q, before and after the change, widens S. With n degrees of
+freedom, n0 of which stand for the calibration's word,
 
     h = (n + 1)/2 log(1 + T / (l n))                                                                             (G4)
 
 takes the place of T/2. A change is told when h exceeds log(looks / alpha), which bounds false alarms by alpha over all
-looks; hypotheses whose h is within log(20) of the best are alternatives to it.
+looks; hypotheses whose h is within log(100) of the best are alternatives to it.
 
 One block's estimate is wrong where the robot was pushed, a wheel slipped on an edge, or the reference jumped: a step of
 the pose at one stretch that explains the last innovations better than any change. It is told as such, the filter goes
@@ -57,7 +58,7 @@ from omnibench.robot.physical import directions_of, unit_of
 _ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal; chosen
 _LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years; chosen
 THRESHOLD: Final = math.log(_LOOKS / _ALPHA)  # of h, Eq. (G4)
-_APART: Final = math.log(20.0)  # of h between a name and its alternatives; chosen, as 95 %
+_APART: Final = math.log(100.0)  # of h between a name and its alternatives; chosen
 _STATED: Final = 12.0  # n0 of Eq. (G4) where the calibration does not say of how many runs it speaks; chosen
 _LEAST_STATED: Final = 3.0  # n0, of few runs or of long-lasting slip; chosen
 _METRES: Final = 1.0  # that the wheels roll in a block; chosen, as slip decorrelates within 2 m
@@ -92,6 +93,7 @@ _PERSISTENT: Final = 5  # steps of one wheel that are no burst any more; chosen
 _SAME_BURST: Final = 6.0  # s within which bursts are one; chosen
 _FIRST_TOLD: Final = ("trajectory", "t", "since", "since_t", "detected_after_m")  # fields that an alarm keeps
 _PASSING: Final = ("push", "slip", "reference_jump", "encoder_")
+_LONGEST_HISTORY: Final = 5000  # blocks; chosen
 _SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual; chosen
 _LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change; chosen
 _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
@@ -104,9 +106,10 @@ Kind = Literal["change", "fault", "burst", "reference"]
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of what it is named after.
+    """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of its name.
 
-    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. untold (q, q): covariance P of Eq. (G3).
+    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. untold (q, q):
+    covariance P of Eq. (G3).
     """
 
     names: tuple[str, ...]
@@ -164,8 +167,8 @@ class Stretch:
     """The motion between two reference poses, as a calibration predicts it, in the robot's frame at its begin.
 
     moved (3,): m, m, rad. slopes (3, q): its derivatives G. spread (3, 3): covariance that slip adds. rolled: m that
-    the wheels rolled in the mean. way: m that the tracked point went. seconds. begun, velocity (3,): at its begin and end, in the frame of its begin, m/s,
-    m/s, rad/s. still: wheels whose encoders stood still while others turned.
+    the wheels rolled in the mean. way: m that the tracked point went. seconds: it took. begun, velocity (3,): at its
+    begin and end, in the frame of its begin, m/s, m/s, rad/s. still: wheels that stood while others turned.
     """
 
     moved: Array
@@ -222,7 +225,9 @@ class Predictor:
         by_row[2, 2] = driven.sum(axis=0)
         rolled = np.hypot(moved[:, 0], moved[:, 1]) + self.reach * np.abs(turn)
         # Slip of each contact, and half as much of the place in all directions.
-        metres = np.abs(driven) * self._of_wheel(self._radii) if self._by_metre else np.repeat(seconds[:, None], signals, 1)
+        metres = (
+            np.abs(driven) * self._of_wheel(self._radii) if self._by_metre else np.repeat(seconds[:, None], signals, 1)
+        )
         metres[rolled <= 0] = 0.0
         carried = np.zeros((len(seconds), 3, 3))
         carried[:, 0, 0] = carried[:, 1, 1] = unit.real
@@ -250,8 +255,8 @@ class Predictor:
 class Alarm(Model):
     """What the guard tells: of a change or a fault its name, value and 95 % interval; of the others their size.
 
-    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low, high:
-    in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
+    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low,
+    high: in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
     detected_after_m: m that the wheels rolled between the two. alternatives: names that explain it nearly as well, of
     which ``advice`` says how to tell them apart.
     """
@@ -284,6 +289,8 @@ class Proposal(Model):
 
     name: str
     value: float
+    low: float | None = None
+    high: float | None = None
     accepted: bool | None = None
     rolled_back: bool = False
     reason: str = ""
@@ -329,7 +336,7 @@ class _Recent:
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """The best hypothesis over onsets: h (P,), changes and deviations (P,), Birge's ratios (P,), and the first block."""
+    """The hypotheses at the best onset: h, changes, their deviations, Birge's ratios (P,), and the first block."""
 
     h: Array
     change: Array
@@ -345,7 +352,8 @@ class _Verdict:
 class Guard:
     """Watches one robot against its calibration. ``begin`` each run, then ``take`` each stretch and the pose after it.
 
-    alarms, proposals: all so far; the last of each may still change. log: told each that is new or has changed.
+    alarms, proposals: all so far; the last of each may still change. history: the way, m, and h of each hypothesis (P,)
+    after the latest blocks. metres, seconds: watched so far.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -358,10 +366,12 @@ class Guard:
         self._offset = max(noise.bias_heading, _OFFSET)
         self.alarms: list[Alarm] = []
         self.proposals: list[Proposal] = []
+        self.history: deque[tuple[float, Array]] = deque(maxlen=_LONGEST_HISTORY)
         self.metres = self.seconds = 0.0
         count = len(self.hypotheses.untold)
         self._untold = self.hypotheses.untold.copy()
         self._assumed, self._delay = np.zeros(count), 0.0
+        self._variances: dict[int, float] = {}  # of these
         self._delays: list[float] = []  # of the runs so far
         self._delay_variance = _DELAY**2
         self._adopted: dict[int, float] = {}  # hypothesis -> change
@@ -381,6 +391,9 @@ class Guard:
         self._last_changed, self._changed_at = np.zeros(3), -math.inf
         self._steps_of: dict[int, int] = {}  # wheel -> steps in a row that are its own
         self._begun = False
+        self._open_at, self._told_at = 0, 0.0  # place of the open alarm, and the way when it was told, m
+        self._shadow_from, self._shadow_errors = 0.0, (0.0, 0.0)
+        self._state, self._covariance = np.zeros(5), np.zeros((5, 5))
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
         """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""
@@ -399,7 +412,7 @@ class Guard:
         self._covariance[4, 4] = variance
         self._deviation = np.zeros((5, len(self._assumed)))  # B of Eq. (G1)
         self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
-        self._faster = np.zeros((3, 3))
+        self._faster, self._white = np.zeros((3, 3)), np.zeros(3)
         self._steady = self._state[3:].copy(), self._covariance[3:, 3:].copy()
         self._begun = False
 
@@ -452,7 +465,10 @@ class Guard:
         spread += self._delay_variance * self._faster
         information = np.linalg.inv(spread)
         square = float(innovation @ information @ innovation)
-        self._squares.append(square)
+        # By differences from one to the next, in which what changed cancels out.
+        white = np.linalg.solve(np.linalg.cholesky(spread), innovation)
+        self._squares.append(float(np.square(white - self._white).sum()) / 2)
+        self._white = white
         if len(self._squares) % _SQUARES == 0:  # a reference that scatters more than it says counts for less
             self._scale = max(1.0, self._scale * float(np.median(self._squares[-_SQUARES:])) / _MEDIAN)
             self._squares = self._squares[-_REMEMBERED:]
@@ -461,7 +477,7 @@ class Guard:
         gain = weight * self._covariance @ measured.T @ information
         slope = measured @ self._deviation
         slope[:, -1] -= velocity
-        told = slope.T @ information * (not stretch.still)
+        told = slope.T @ information
         along = slope @ self.hypotheses.directions
         told_along = along.T @ information
         whole = told @ slope
@@ -582,14 +598,15 @@ class Guard:
             along = turn @ matrix[:, low:high]
             score = along.T @ b
             explained.append(float(score @ np.linalg.lstsq(along.T @ a @ along, score)[0]) / 2)
+        still = {wheel for part in parts for wheel in part.still}
+        silent = max(still, key=lambda wheel: explained[wheel], default=None)
+        if silent is not None and explained[silent] > _MOSTLY * gain:
+            return f"encoder_{self.calibration.robot.wheel_names[silent]}", "fault"
         wheel = int(np.argmax(explained))
-        name = self.calibration.robot.wheel_names[wheel]
         if explained[wheel] > _MOSTLY * gain:
-            if any(wheel in part.still for part in parts):
-                return f"encoder_{name}", "fault"
             self._steps_of[wheel] = self._steps_of.get(wheel, 0) + 1
             if self._steps_of[wheel] > _PERSISTENT:
-                return f"slip_{name}", "fault"
+                return f"slip_{self.calibration.robot.wheel_names[wheel]}", "fault"
         else:
             self._steps_of.clear()
         seconds = float(np.mean([part.seconds for part in parts]))
@@ -621,6 +638,49 @@ class Guard:
             return []
         return self._judge()
 
+    def end(self) -> None:
+        """Judge what waits, at the end of the last run."""
+        self._flush()
+
+    def proposed(self) -> Calibration | None:
+        """The calibration with the changes that were accepted and not rolled back; None if there are none."""
+        names = [each.name for each in self.proposals if each.accepted and not each.rolled_back]
+        if not names:
+            return None
+        calibration, hypotheses = self.calibration, self.hypotheses
+        change = np.zeros(calibration.matrix_array.size)
+        accepted = [named for named in self._adopted if hypotheses.names[named] in names]
+        more = self._refined(accepted)
+        for named, refinement in zip(accepted, more, strict=True):
+            change += (self._adopted[named] + refinement) * hypotheses.directions[: len(change), named]
+        changed: dict[str, object] = {
+            "matrix": _rows(calibration.matrix_array, change),
+            "name": f"{calibration.name}+{'+'.join(names)}",
+        }
+        if calibration.plain is not None:
+            changed["plain"] = _rows(np.array(calibration.plain), change)
+        if calibration.parameters is not None:
+            known = dict(calibration.parameters)
+            for each in self.proposals:
+                if each.name in known and each.name in names:
+                    shift = dict(zip((hypotheses.names[named] for named in accepted), more, strict=True))[each.name]
+                    low, high = ((each.low or 0.0) + shift, (each.high or 0.0) + shift)
+                    update = {"value": each.value + shift, "low": low, "high": high}
+                    known[each.name] = known[each.name].model_copy(update=update)
+            changed["parameters"] = known
+        return calibration.model_copy(update=changed)
+
+    def _refined(self, accepted: Sequence[int]) -> list[float]:
+        """What motion since then adds to the values of accepted changes, as far as they were not sure."""
+        if not self._blocks or not accepted:
+            return [0.0] * len(accepted)
+        directions = self.hypotheses.directions[:, accepted]
+        ratio = max(self._ratio, _LEAST_RATIO)
+        whole = np.sum([block.whole for block in self._blocks], axis=0) / ratio
+        score = np.sum([block.score for block in self._blocks], axis=0) / ratio
+        precision = np.diag([1 / max(self._variances[named], 1e-30) for named in accepted])
+        return list(np.linalg.solve(directions.T @ whole @ directions + precision, directions.T @ score).tolist())
+
     def _flush(self) -> None:
         """Enter what waits, at the end of a run."""
         while self._recent:
@@ -643,6 +703,7 @@ class Guard:
             del self._blocks[first + 1]
             size *= 2
         verdict = self._verdict()
+        self.history.append((self.metres, verdict.h))
         self._ratio = float(np.median(verdict.ratio))
         self._weigh(block, verdict)
         if not self._blocks or (self._alarm is None and verdict.h[verdict.best] <= THRESHOLD):
@@ -674,7 +735,9 @@ class Guard:
                 ratios[row] = np.maximum(ratios[row], ratio)
         # What the blocks before tell of what the calibration does not know, and what is left of it.
         wholes, scores = (
-            np.cumsum([np.zeros_like(getattr(self._blocks[0], name)), *(getattr(each, name) for each in self._blocks)], 0)
+            np.cumsum(
+                [np.zeros_like(getattr(self._blocks[0], name)), *(getattr(each, name) for each in self._blocks)], 0
+            )
             for name in ("whole", "score")
         )
         common = np.median(ratios, axis=1)
@@ -798,17 +861,21 @@ class Guard:
             self._shadow = (named, change, variance, evidence)
             other = verdict.best
             ousted = other != named and verdict.h[other] > verdict.h[named] + _APART
-            if evidence > level or evidence < -level or ousted:
-                accepted = evidence > level
+            sure = other == named and float(np.partition(verdict.h, -2)[-2]) < verdict.h[named] - _APART
+            if (evidence > level and sure) or evidence < -level or ousted:
+                accepted = evidence > level and not ousted
                 reason = "predicts later motion better" if accepted else "predicts later motion worse"
                 if ousted and not accepted:
                     reason = f"{self.hypotheses.names[other]} explains it better"
                 self._note(accepted=accepted, reason=reason)
                 if accepted:
                     refined, deviation = float(verdict.change[named]), float(verdict.deviation[named])
-                    self.proposals[-1] = self.proposals[-1].model_copy(
-                        update={"value": float(self.hypotheses.values[named] + self._assumed_along(named) + refined)}
-                    )
+                    value = float(self.hypotheses.values[named] + self._assumed_along(named) + refined)
+                    interval = {"low": value - 1.96 * deviation, "high": value + 1.96 * deviation}
+                    self.proposals[-1] = self.proposals[-1].model_copy(update={"value": value, **interval})
+                    told = self._alarm_of(verdict, self._blocks[verdict.first].since)
+                    kept = {name: getattr(self.alarms[self._open_at], name) for name in _FIRST_TOLD}
+                    self.alarms[self._open_at] = told.model_copy(update=kept)
                     self._adopt(named, refined, deviation**2)
                     self._kept = (named, refined, 0.0)
                 else:
@@ -850,17 +917,23 @@ class Guard:
         if self.hypotheses.names[named] == "reference_clock":
             self._delay += change
             self._state[3] += change
+        self._variances[named] = variance
         self._untold = self._untold + variance * direction[:, None] * direction
         verdict = self._verdict()
         self._usual_ratio = verdict.ratio
         self._freedom = np.minimum(self._freedom + sum(block.count for block in self._blocks), _LONGEST_MEMORY)
         self._blocks.clear()
         self._recent.clear()
+        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._alarm, self._shadow = None, None
 
     def _assumed_along(self, named: int) -> float:
         """The part of what was adopted that is this hypothesis's, in its unit."""
         return self._adopted.get(named, 0.0)
+
+
+def _rows(matrix: Array, change: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, (matrix + change.reshape(matrix.shape)).tolist()))
 
 
 def _scatter_within(a: Array, b: Array, within: Array, groups: Array) -> tuple[Array, Array]:

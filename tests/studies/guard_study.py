@@ -44,7 +44,8 @@ def robot_of(kind: str) -> Robot:
     """The design of a class, as a robot file has it."""
     if kind == "omni":
         wheels = [
-            {"name": n, "type": "omni", "radius": r, "distance": d, "angle": a} for n, (r, a, d) in DESIGNS[kind].items()
+            {"name": n, "type": "omni", "radius": r, "distance": d, "angle": a}
+            for n, (r, a, d) in DESIGNS[kind].items()
         ]
     else:
         form = "fixed" if kind == "differential" else "steered"
@@ -104,7 +105,7 @@ class Truth:
 
 
 def commands(kind: str, seconds: float, rng: np.random.Generator) -> Array:
-    """Twists (F, 3) that are commanded: straight, turning, on the spot, sideways and standing, each for some seconds."""
+    """Twists (F, 3) that are commanded: straight, turning, on the spot and standing, each for some seconds."""
     parts = []
     while sum(map(len, parts)) * STEP < seconds:
         count = int(rng.uniform(2, 8) / STEP)
@@ -240,7 +241,11 @@ def befallen(drive: Drive, what: str, start: int, rng: np.random.Generator) -> t
         x = turned[:, 0] * np.cos(angles) - turned[:, 1] * np.sin(angles)
         y = turned[:, 0] * np.sin(angles) + turned[:, 1] * np.cos(angles)
         poses = np.column_stack(
-            [pivot[0] + x + share * way * math.cos(angle), pivot[1] + y + share * way * math.sin(angle), poses[:, 2] + angles]
+            [
+                pivot[0] + x + share * way * math.cos(angle),
+                pivot[1] + y + share * way * math.sin(angle),
+                poses[:, 2] + angles,
+            ]
         )
     elif what == "encoder":  # silent for 4 s
         signals[start : start + 80, 0] = 0.0
@@ -292,7 +297,9 @@ def main() -> None:
                 alarm = guard.alarms[-1] if guard.alarms else None
                 right = alarm is not None and alarm.name == what and not alarm.alternatives
                 name = "none" if alarm is None else alarm.name + ("?" if alarm.alternatives else "")
-                results[what.partition("_")[0], share].append((right, alarm.detected_after_m if alarm else math.inf, name))
+                results[what.partition("_")[0], share].append(
+                    (right, alarm.detected_after_m if alarm else math.inf, name)
+                )
             for what in EVENTS:
                 if what == "encoder" and kind == "swerve":
                     continue
@@ -305,7 +312,9 @@ def main() -> None:
                 told = [alarm.name for alarm in guard.alarms]
                 right = bool(told) and all(name.startswith(EVENTS[what]) for name in told)
                 wrongly = [each.name for each in guard.proposals if each.accepted]
-                events[what].append((right and not wrongly, ",".join(told) + (f" accepted {wrongly}" if wrongly else "")))
+                events[what].append(
+                    (right and not wrongly, ",".join(told) + (f" accepted {wrongly}" if wrongly else ""))
+                )
             clock = time.process_time()
             per_robot = options.false_hours * 3600 / options.robots
             drive = driven(truth, commands(kind, per_robot, rng), rng)
@@ -317,14 +326,14 @@ def main() -> None:
             for alarm in guard.alarms:
                 false[alarm.name] += 1
         for (what, share), rows in results.items():
-            right = np.mean([row[0] for row in rows])
-            delay = np.median([row[1] for row in rows])
-            wrong = Counter(row[2] for row in rows if not row[0])
-            print(f"{kind:13} {what} {share:+.1%}: named {right:.0%} of {len(rows)}, median after {delay:.1f} m; {dict(wrong)}")
+            right, delay = np.mean([row[0] for row in rows]), np.median([row[1] for row in rows])
+            wrong = dict(Counter(row[2] for row in rows if not row[0]))
+            print(f"{kind:13} {what} {share:+.1%}: {right:.0%} of {len(rows)} named, median {delay:.1f} m; {wrong}")
         for what, told_of in events.items():
-            wrong = Counter(row[1] for row in told_of if not row[0])
-            print(f"{kind:13} {what}: told as such {np.mean([row[0] for row in told_of]):.0%} of {len(told_of)}; {dict(wrong)}")
-        print(f"{kind:13} false alarms in {hours:.1f} h: {sum(false.values())} {dict(false)}; {1e6 * spent / stretches:.0f} us a pose")
+            right, wrong = np.mean([row[0] for row in told_of]), dict(Counter(row[1] for row in told_of if not row[0]))
+            print(f"{kind:13} {what}: {right:.0%} of {len(told_of)} told as such; {wrong}")
+        alarms = f"{sum(false.values())} false alarms in {hours:.1f} h {dict(false)}"
+        print(f"{kind:13} {alarms}; {1e6 * spent / stretches:.0f} us a pose")
         sys.stdout.flush()
 
 

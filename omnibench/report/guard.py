@@ -1,0 +1,164 @@
+"""What a guard told of a recording, as it is shown: alarms, proposals, and the estimates over the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from omnibench.live.guard import THRESHOLD, Alarm, Guard
+from omnibench.live.guard_recording import GuardReport
+from omnibench.report.blocks import (
+    Column,
+    Document,
+    Fact,
+    Figure,
+    FigureGrid,
+    LegendItem,
+    Row,
+    Table,
+    answer_section,
+    columns,
+    simulated_badge,
+)
+from omnibench.report.figures import line
+from omnibench.report.result import NextStep, Remark, Result
+from omnibench.report.style import PALETTE, plot
+from omnibench.words import kind_of_data, plural
+
+_SHOWN = 6  # hypotheses that the picture shows; chosen
+
+
+def alarm_in_words(alarm: Alarm) -> str:
+    """An alarm as one sentence without a full stop: what, by how much, since when."""
+    size = "" if alarm.value is None else f" {_number(alarm.value, alarm.unit)}"
+    if alarm.low is not None and alarm.high is not None:
+        size = f" is {_number(alarm.value or 0.0, alarm.unit)} ({alarm.low:.5g} to {alarm.high:.5g})"
+    if alarm.alternatives:
+        return f"{alarm.name}{size}, or {', '.join(alarm.alternatives)}: {alarm.advice or 'no motion tells yet'}"
+    return f"{alarm.name}{size}"
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.5g}" + ("" if unit == "1" else f" {unit}")
+
+
+class GuardResult(Result):
+    """What a guard told, of the calibration in ``file`` on data sets as they were typed. proposed: the file written."""
+
+    title = "guard"
+
+    def __init__(
+        self,
+        report: GuardReport,
+        guard: Guard,
+        dataset: str,
+        simulated: bool,
+        file: Path,
+        sources: Sequence[Path] = (),
+        proposed: Path | None = None,
+    ) -> None:
+        self.report, self.guard, self.dataset, self.simulated = report, guard, dataset, simulated
+        self.file, self.sources, self.proposed = file, sources, proposed
+
+    def sentence(self) -> str:
+        report = self.report
+        driven = f"{report.metres:.0f} m of {self.dataset} ({kind_of_data(self.simulated)})"
+        changes = [alarm for alarm in report.alarms if alarm.kind in ("change", "fault")]
+        if changes:
+            return f"In {driven}: {'; '.join(map(alarm_in_words, changes))}."
+        others = f"; {plural(len(report.alarms), 'passing event')}" if report.alarms else ""
+        return f"Nothing changed in {driven}, as far as {self.file.name} states its noise{others}."
+
+    def tables(self) -> Sequence[Table]:
+        tables = []
+        if self.report.alarms:
+            rows: list[Row] = []
+            for alarm in self.report.alarms:
+                interval = "" if alarm.low is None or alarm.high is None else f"{alarm.low:.5g} to {alarm.high:.5g}"
+                told = f"{alarm.trajectory} {alarm.t:.1f} s"
+                value = "" if alarm.value is None else _number(alarm.value, alarm.unit)
+                cells = (alarm.kind, alarm.name, value, interval, told, f"{alarm.detected_after_m:.1f}")
+                rows.append(Row.of(*cells, ", ".join(alarm.alternatives)))
+            words = (Column(title, numeric=False) for title in ("name", "value", "interval", "told in"))
+            head = columns("kind", *words, "after (m)", Column("or", numeric=False))
+            tables.append(Table("alarms", head, tuple(rows)))
+        if self.report.proposals:
+            rows = []
+            for each in self.report.proposals:
+                verdict = {True: "accepted", False: "rejected", None: "in shadow"}[each.accepted]
+                verdict = "rolled back" if each.rolled_back else verdict
+                ratio = each.held_out.error_ratio
+                error = "" if ratio is None else f"{ratio - 1:+.0%}"
+                rows.append(Row.of(each.name, f"{each.value:.6g}", verdict, f"{each.held_out.metres:.0f}", error))
+            head = columns("proposal", "value", Column("verdict", numeric=False), "judged on (m)", "error there")
+            tables.append(Table("proposals", head, tuple(rows)))
+        return tables
+
+    def remarks(self) -> Sequence[Remark]:
+        lines = [Remark(f"{alarm.name}: {alarm.advice}", "warning") for alarm in self.report.alarms if alarm.advice]
+        if self.proposed is not None:
+            lines.append(Remark(f"{self.proposed} holds the accepted values", "good"))
+        return lines
+
+    def next_step(self) -> NextStep:
+        accepted = [each for each in self.report.proposals if each.accepted and not each.rolled_back]
+        if accepted and self.proposed is None:
+            command: tuple[object, ...] = ("omnibench", "guard", *self.sources, "--calibration", self.file)
+            return NextStep(
+                f"{', '.join(each.name for each in accepted)} changed",
+                "write the calibration with the accepted values",
+                (*command, "-o", "changed.yaml"),
+            )
+        if accepted:
+            return NextStep(
+                f"{', '.join(each.name for each in accepted)} changed",
+                "see what that gains",
+                ("omnibench", "evaluate", self.proposed, *self.sources),
+            )
+        faults = [alarm for alarm in self.report.alarms if alarm.kind == "fault"]
+        if faults:
+            return NextStep(f"{faults[-1].name}", "look at that wheel and its encoder, then check the recording again")
+        changes = [alarm for alarm in self.report.alarms if alarm.kind == "change"]
+        if changes:
+            advice = changes[-1].advice or "record more after the change"
+            command = ("omnibench", "calibrate", *self.sources, "-o", "calibration.yaml")
+            return NextStep(f"{changes[-1].name} may have changed", f"{advice}, or calibrate anew", command)
+        return NextStep("the calibration holds", "")
+
+    def figures(self) -> Sequence[FigureGrid]:
+        """Estimates of what may have changed over the way, in standard deviations of what is told."""
+        history, names = self.guard.history, self.guard.hypotheses.names
+        if not history:
+            return ()
+        metres = np.array([point[0] for point in history])
+        strengths = [point[1] for point in history]
+        strongest = sorted(range(len(names)), key=lambda j: -max(float(row[j]) for row in strengths))[:_SHOWN]
+        traces, legend = [], []
+        for number, j in enumerate(strongest):
+            item = LegendItem(names[j], names[j], PALETTE[number % len(PALETTE)])
+            legend.append(item)
+            hover = f"{names[j]}<br>%{{x:.0f}} m: %{{y:.1f}}"
+            traces.append(line(item, 1.6, metres, np.array([row[j] for row in strengths]), hover=hover))
+        figure = plot(*traces, x_title="driven (m)", y_title="evidence, h of Eq. (G4)")
+        figure.add_hline(y=THRESHOLD, line_dash="dash", annotation_text="told from here on")
+        words = f"Evidence for {', '.join(names[j] for j in strongest)} over {metres[-1]:.0f} m."
+        return (FigureGrid((Figure("Evidence for a change", figure, words),), tuple(legend), 1, name="evidence"),)
+
+    def document(self) -> Document:
+        report = self.report
+        changes = sum(alarm.kind in ("change", "fault") for alarm in report.alarms)
+        tiles = (
+            Fact("driven", f"{report.metres:.0f} m"),
+            Fact("changes and faults", f"{changes}"),
+            Fact("bursts and the reference", f"{len(report.alarms) - changes}"),
+        )
+        answer = answer_section(self.sentence(), tiles, *self.tables(), *self.figures())
+        subtitle = f"{self.guard.calibration.name}, against the reference of {self.dataset}"
+        return Document(
+            f"Guard of {self.guard.calibration.robot.name}", subtitle, (answer,), simulated_badge(self.simulated)
+        )
+
+    def json(self) -> GuardReport:
+        return self.report

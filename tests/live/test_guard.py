@@ -1,0 +1,165 @@
+"""The guard on drives that guard_study.py simulates, by code that shares nothing with it, and on recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from guard_study import STEP, Drive, Truth, befallen, calibrated, commands, driven, watched
+from real_recordings import OPTIODOM
+
+import omnibench
+from omnibench.errors import DataError
+from omnibench.live.guard import Alarm, Guard
+from omnibench.live.guard_recording import watch_recording
+from omnibench.robot.calibration import Calibration
+from omnibench.robot.kinematics import Array
+from omnibench.robot.physical import directions_of
+
+CHANGED = 2000  # step at which something happens: after 100 s
+
+
+@pytest.fixture(scope="module", params=["differential", "omni"])
+def robot(request: pytest.FixtureRequest) -> tuple[Truth, Calibration]:
+    """A simulated robot and its calibration by runs of its own."""
+    rng = np.random.default_rng(4)
+    truth = Truth.drawn(request.param, rng)
+    return truth, calibrated(truth, rng)
+
+
+def told(calibration: Calibration, drive: Drive, seed: int = 0, slam: Array | None = None) -> Guard:
+    """A guard that has watched a drive with SLAM."""
+    guard = Guard(calibration)
+    for _ in watched(guard, drive, np.random.default_rng(seed), slam):
+        pass
+    return guard
+
+
+def drive_of(truth: Truth, seconds: float = 300.0, seed: int = 1, then: Truth | None = None) -> Drive:
+    rng = np.random.default_rng(seed)
+    twists = commands(truth.kind, seconds, rng)
+    return driven(truth, twists, rng, None if then is None else (CHANGED, then))
+
+
+def test_a_robot_that_drives_as_calibrated_is_left_alone(robot: tuple[Truth, Calibration]) -> None:
+    truth, calibration = robot
+    guard = told(calibration, drive_of(truth, 600.0))
+    assert guard.alarms == []
+    assert guard.proposals == []
+    assert guard.proposed() is None
+
+
+def test_the_wheel_that_changed_is_named_with_its_radius_and_proposed(robot: tuple[Truth, Calibration]) -> None:
+    truth, calibration = robot
+    wheel = list(truth.wheels)[1]
+    changed = truth.changed(f"radius_{wheel}", -0.01)
+    guard = told(calibration, drive_of(truth, then=changed))
+    (alarm,) = guard.alarms
+    assert (alarm.kind, alarm.name, alarm.alternatives) == ("change", f"radius_{wheel}", ())
+    assert alarm.detected_after_m < 20
+    assert alarm.t > CHANGED * STEP
+    assert alarm.low is not None
+    assert alarm.high is not None
+    assert alarm.low < alarm.high
+    assert alarm.value == pytest.approx(changed.wheels[wheel][0], rel=2e-3)
+    (proposal,) = guard.proposals
+    assert proposal.accepted
+    assert not proposal.rolled_back
+    proposed = guard.proposed()
+    assert proposed is not None
+    again = told(proposed, drive_of(changed, 300.0, seed=2))
+    assert again.alarms == []
+
+
+@pytest.mark.parametrize(
+    ("what", "kind", "names"),
+    [
+        ("push", "burst", ("push", "slip")),
+        ("edge", "burst", ("push", "slip")),
+        ("jump", "reference", ("reference_jump",)),
+        ("encoder", "fault", ("encoder_",)),
+        ("scale", "reference", ("reference_scale",)),
+    ],
+)
+def test_what_passes_is_told_as_such_and_changes_no_parameter(
+    robot: tuple[Truth, Calibration], what: str, kind: str, names: Sequence[str]
+) -> None:
+    truth, calibration = robot
+    drive = drive_of(truth)
+    start = CHANGED + int(np.argmax(np.abs(drive.signals[CHANGED:, 0]) > 4.0))
+    changed, slam = befallen(drive, what, start, np.random.default_rng(3))
+    guard = told(calibration, changed, slam=slam)
+    assert {alarm.kind for alarm in guard.alarms} == {kind}
+    assert all(alarm.name.startswith(tuple(names)) for alarm in guard.alarms)
+    assert guard.proposed() is None
+
+
+def test_a_robot_that_stands_moves_no_parameter(robot: tuple[Truth, Calibration]) -> None:
+    truth, calibration = robot
+    still = drive_of(truth, 300.0)
+    quiet = Drive(0 * still.signals, np.zeros_like(still.poses), 0 * still.rates, still.steering)
+    guard = told(calibration, quiet)
+    assert guard.alarms == []
+    assert guard.metres == 0.0
+
+
+def test_straight_driving_leaves_open_which_of_two_changed_and_says_what_to_drive(
+    robot: tuple[Truth, Calibration],
+) -> None:
+    truth, calibration = robot
+    wider = truth
+    for name in truth.wheels:
+        wider = wider.changed(f"radius_{name}", -0.02)
+    rng = np.random.default_rng(0)
+    twists = np.tile([0.5, 0.0, 0.0], (round(300 / STEP), 1))
+    guard = told(calibration, driven(truth, twists, rng, (CHANGED, wider)))
+    alarm = guard.alarms[0]
+    assert {"floor", "reference_scale"} <= {alarm.name, *alarm.alternatives}
+    assert "turn on the spot" in alarm.advice
+    assert guard.proposed() is None
+
+
+def changed_calibration(calibration: Calibration, name: str, share: float) -> Calibration:
+    """A calibration with a wrong parameter."""
+    design, slopes = directions_of(calibration.robot)[name]
+    matrix = calibration.matrix_array + (share * design * slopes).reshape(3, -1)
+    return calibration.model_copy(update={"matrix": tuple(map(tuple, matrix.tolist())), "parameters": None})
+
+
+def test_a_real_robot_shows_which_radius_of_its_calibration_is_wrong() -> None:
+    squares = OPTIODOM / "diff" / "square"
+    if not squares.is_dir():
+        pytest.skip(f"the recordings are not at {squares}")
+    dataset = omnibench.import_dataset("optiodom", squares)
+    calibration = omnibench.calibrate(dataset).calibration
+    right, _ = watch_recording(calibration, dataset)
+    assert not [alarm for alarm in right.alarms if alarm.kind == "change"]
+    for name in ("radius_left", "radius_right"):
+        wrong = changed_calibration(calibration, name, 0.01)
+        report, guard = watch_recording(wrong, dataset)
+        assert [alarm.name for alarm in report.alarms if alarm.kind == "change"] == [name]
+        proposed = guard.proposed()
+        assert proposed is not None
+        before, after = (omnibench.evaluate(each, dataset).splits["all"].cost for each in (calibration, proposed))
+        assert after < 1.1 * before
+
+
+def test_a_calibration_of_other_wheels_is_refused(robot: tuple[Truth, Calibration]) -> None:
+    _, calibration = robot
+    wheels = [{"name": n, "type": "fixed", "radius": 0.05, "x": 0, "y": y} for n, y in (("l", 0.1), ("r", -0.1))]
+    other = omnibench.make_dataset(
+        "other",
+        omnibench.Robot.model_validate({"name": "cart", "wheels": wheels}),
+        wheels={"t": [0.1, 0.2], "omega_l": [1.0, 1.0], "omega_r": [1.0, 1.0]},
+        poses={"t": [0.0, 0.2], "x": [0.0, 0.01], "y": [0.0, 0.0], "theta": [0.0, 0.0]},
+    )
+    with pytest.raises(DataError, match="is for wheels"):
+        watch_recording(calibration, other)
+
+
+def test_the_json_of_an_alarm_has_the_fields_that_scripts_read() -> None:
+    assert {"kind", "name", "value", "low", "high", "trajectory", "t", "detected_after_m", "alternatives"} <= set(
+        json.loads(json.dumps(Alarm.model_json_schema()))["properties"]
+    )
