@@ -176,54 +176,32 @@ class ReferenceCorrection:
         )
 
 
-def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMeasurement:
-    """A pose whose heading was measured at another time, with its heading turned to the time of the position.
-
-    before, after: odometry's poses (3,) at the time of the heading and at that of the position.
-    """
-    pose: Array = measurement.pose + np.array([0.0, 0.0, after[2] - before[2]])
-    return replace(measurement, pose=pose, heading_stamp=None)
-
-
-def of_centre(measurement: PoseMeasurement) -> PoseMeasurement:
-    """The pose of the robot's centre, from that of a point of the robot."""
-    if measurement.mount is None:
-        return measurement
-    pose = RobotCentre(measurement.mount).pose(measurement.pose)
-    covariance = carried(measurement.covariance, (pose - measurement.pose)[:2])
-    return replace(measurement, pose=pose, covariance=covariance, mount=None)
-
-
 _TURN = 2 * math.pi
 _POSE = np.eye(3)  # measurement matrix: SLAM measures the pose itself
 
 
 class PoseFilter:
-    """Pose (3,) and covariance (3, 3); motions predict them, measured poses correct them."""
+    """Pose (3,) in m, m, rad, the heading not wrapped, and covariance (3, 3) by an extended Kalman filter."""
 
     def __init__(self, pose: Array, covariance: Array) -> None:
         self._filter: Any = ExtendedKalmanFilter(dim_x=3, dim_z=3)
-        self._filter.predict_x = self._predict_pose
-        self._filter.Q = np.zeros((3, 3))
+        self._derivative = np.eye(3)  # F, of the pose after a motion by the pose before
+        self._noise = np.zeros((3, 3))  # Q
         self.set(pose, covariance)
-
-    @property
-    def pose(self) -> Array:
-        """(3,): m, m, rad; the heading is not wrapped."""
-        return self._filter.x
-
-    @property
-    def covariance(self) -> Array:
-        return self._filter.P
 
     def set(self, pose: Array, covariance: Array) -> None:
         """Replace pose and covariance."""
-        self._filter.x = np.array(pose, dtype=float)
-        self._filter.P = np.array(covariance, dtype=float)
+        self.pose: Array = np.array(pose, dtype=float)
+        self.covariance: Array = np.array(covariance, dtype=float)
 
     def predict(self, motion: Motion) -> None:
-        """Carry pose and covariance along a motion."""
-        self._filter.predict(motion)
+        """Carry pose and covariance along a motion: P <- F P F^T + Q."""
+        before, self.pose = self.pose, advance(self.pose, motion.moved, motion.integration)
+        (x, y, _), (to_x, to_y, _) = before.tolist(), self.pose.tolist()
+        self._derivative[0, 2], self._derivative[1, 2] = y - to_y, to_x - x
+        self._noise[0, 0] = self._noise[1, 1] = motion.position_variance
+        self._noise[2, 2] = motion.heading_variance
+        self.covariance = self._derivative.dot(self.covariance).dot(self._derivative.T) + self._noise
 
     def normalised_innovation(self, pose: Array, covariance: Array) -> float:
         """Normalised innovation squared of a measured pose: chi-square with 3 degrees of freedom in theory."""
@@ -232,16 +210,9 @@ class PoseFilter:
 
     def correct(self, pose: Array, covariance: Array) -> None:
         """Correct pose and covariance by a measured pose (3,) with its covariance (3, 3)."""
+        self._filter.x, self._filter.P = self.pose, self.covariance
         self._filter.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
-
-    def _predict_pose(self, motion: Motion) -> None:
-        """The motion model of odometry in filterpy's prediction: pose, its derivative F and noise Q."""
-        before, after = self.pose, advance(self.pose, motion.moved, motion.integration)
-        self._filter.x = after
-        self._filter.F[0, 2] = before[1] - after[1]
-        self._filter.F[1, 2] = after[0] - before[0]
-        self._filter.Q[0, 0] = self._filter.Q[1, 1] = motion.position_variance
-        self._filter.Q[2, 2] = motion.heading_variance
+        self.pose, self.covariance = self._filter.x, self._filter.P
 
 
 def innovation_of(measured: Array, expected: Array) -> Array:
@@ -251,51 +222,11 @@ def innovation_of(measured: Array, expected: Array) -> Array:
     return difference
 
 
-# Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
-_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])
-
-
-class Rejections:
-    """The latest rejected poses, with odometry's poses at their times.
-
-    enough: number of poses that have to agree. limit: of the squared Mahalanobis distance of two poses that agree.
-    in_a_row: poses rejected since one was fused.
-    """
-
-    def __init__(self, enough: int, limit: float) -> None:
-        self._enough = enough
-        self._limit = limit
-        self._poses: deque[tuple[PoseMeasurement, Array]] = deque(maxlen=enough)
-        self.in_a_row = 0
-
-    def clear(self) -> None:
-        """Forget them: a pose was fused, or the map's frame or the clock has changed."""
-        self._poses.clear()
-        self.in_a_row = 0
-
-    def known(self, stamp: int) -> bool:
-        """True if a pose of this time was rejected already."""
-        return any(measurement.stamp == stamp for measurement, _ in self._poses)
-
-    def add(self, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """Add a rejected pose; True if enough agree on where the robot is. odometry (3,): pose in odom at its time."""
-        self.in_a_row += 1
-        self._poses.append((measurement, odometry))
-        return len(self._poses) == self._enough and all(
-            self._agrees(*each, measurement, odometry) for each in self._poses
-        )
-
-    def _agrees(self, earlier: PoseMeasurement, before: Array, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """True if the earlier pose, moved on by odometry from ``before``, is the later one."""
-        carried = compose(earlier.pose, relative(before, odometry))
-        innovation = innovation_of(measurement.pose, carried)
-        spread = measurement.covariance + earlier.covariance + _DRIFT
-        return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit
-
-
 _NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # m, rad: covariance before the robot is located; chosen
 _WAITING = 16  # poses that may wait for the wheel samples of their time; chosen
 _EVER = -(2**63)  # ns, before every stamp
+# Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
+_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])
 
 Outcome = Literal["fused", "located", "reacquired", "rejected", "too late", "ahead", "waiting", "duplicate"]
 
@@ -323,7 +254,8 @@ class Fusion:
     """Pose of one robot in the map, by a Kalman filter over its timeline.
 
     located: True once a pose or an order has said where the robot is. outcome: of the pose that was taken last.
-    fused_at: arrival of the last pose that was fused, s, monotonic; None since a reset.
+    fused_at: arrival of the last pose that was fused, s, monotonic; None since a reset. rejected_in_a_row: poses that
+    the gate rejected since one was fused.
     """
 
     def __init__(self, settings: FusionSettings, timeline: Timeline, counts: Counts) -> None:
@@ -332,7 +264,9 @@ class Fusion:
         self._counts = counts
         self._filter = PoseFilter(np.zeros(3), _NOWHERE)
         self._limit = 2.0 * float(gammaincinv(3 / 2, settings.gate))  # quantile of chi2 with 3 degrees of freedom
-        self._rejections = Rejections(settings.reacquire_after, self._limit)
+        # The latest rejected poses, with odometry's poses (3,) at their times; enough that agree are believed
+        self._rejected: deque[tuple[PoseMeasurement, Array]] = deque(maxlen=settings.reacquire_after)
+        self.rejected_in_a_row = 0
         self._waiting: deque[PoseMeasurement] = deque()
         self._since = _EVER  # ns; poses measured before are too late, as the pose was set then
         self.located = False
@@ -348,11 +282,6 @@ class Fusion:
     def covariance(self) -> Array:
         """Covariance (3, 3) of the pose."""
         return self._filter.covariance
-
-    @property
-    def rejected_in_a_row(self) -> int:
-        """Poses that the gate rejected since one was fused."""
-        return self._rejections.in_a_row
 
     def begin(self, pose: Array, covariance: Array | None) -> None:
         """Set the pose before the first wheel sample; covariance None: the robot is not located."""
@@ -376,7 +305,7 @@ class Fusion:
         self.outcome = self._refused(measurement) or self._fused_or_rejected(self._at_one_time(measurement))
         if self.outcome in ("fused", "located", "reacquired"):
             self._counts.poses += 1
-            self._rejections.clear()
+            self._forget_rejected()
             self.fused_at = measurement.arrival
         return self.outcome
 
@@ -387,7 +316,7 @@ class Fusion:
             return
         self._since = self._timeline.newest + 1
         self._waiting.clear()
-        self._rejections.clear()
+        self._forget_rejected()
         self.located = True
         self._filter.set(pose, covariance)
         newest = self._timeline.entries[-1]
@@ -404,7 +333,7 @@ class Fusion:
     def restart(self) -> None:
         """Forget the poses that wait or were rejected: the clock jumped, and their stamps have no meaning."""
         self._waiting.clear()
-        self._rejections.clear()
+        self._forget_rejected()
         self._since = _EVER
 
     def at(self, stamp: int) -> tuple[Array, Array] | None:
@@ -434,20 +363,26 @@ class Fusion:
             self._counts.pose_too_late += 1
             return "too late"
         fused = timeline.entries[timeline.index(measurement.stamp)].measurements
-        if any(earlier.stamp == measurement.stamp for earlier in fused) or self._rejections.known(measurement.stamp):
+        if any(
+            earlier.stamp == measurement.stamp for earlier in (*fused, *(rejected for rejected, _ in self._rejected))
+        ):
             self._counts.pose_duplicates += 1
             return "duplicate"
         return None
 
     def _at_one_time(self, measurement: PoseMeasurement) -> PoseMeasurement:
         """The centre's pose, its heading turned by odometry to the time of its position if it is of another."""
-        if measurement.heading_stamp is None:
-            return of_centre(measurement)
-        before = self._timeline.odometry_at(measurement.heading_stamp)
-        after = self._timeline.odometry_at(measurement.stamp)
-        assert before is not None
-        assert after is not None
-        return of_centre(turned(measurement, before, after))
+        pose, covariance = measurement.pose, measurement.covariance
+        if measurement.heading_stamp is not None:
+            before = self._timeline.odometry_at(measurement.heading_stamp)
+            after = self._timeline.odometry_at(measurement.stamp)
+            assert before is not None
+            assert after is not None
+            pose = pose + np.array([0.0, 0.0, after[2] - before[2]])
+        if measurement.mount is not None:
+            tracked, pose = pose, RobotCentre(measurement.mount).pose(pose)
+            covariance = carried(covariance, (pose - tracked)[:2])
+        return replace(measurement, pose=pose, covariance=covariance, heading_stamp=None, mount=None)
 
     def _fused_or_rejected(self, measurement: PoseMeasurement) -> Outcome:
         """Fuse a pose whose time is within the timeline, or reject it by the gate."""
@@ -462,13 +397,28 @@ class Fusion:
             return "fused"
         odometry = self._timeline.odometry_at(measurement.stamp)
         assert odometry is not None
-        if self._rejections.add(measurement, odometry):
+        self.rejected_in_a_row += 1
+        self._rejected.append((measurement, odometry))
+        if len(self._rejected) == self._rejected.maxlen and all(
+            self._agree(earlier, measurement, relative(before, odometry)) for earlier, before in self._rejected
+        ):
             self._replace(index, measurement)
             self._counts.reacquired += 1
             return "reacquired"
         self._counts.pose_rejected += 1
         self._filter.set(self._timeline.entries[-1].pose, self._timeline.entries[-1].covariance)
         return "rejected"
+
+    def _agree(self, earlier: PoseMeasurement, later: PoseMeasurement, moved: Array) -> bool:
+        """True if a rejected pose, moved by odometry (3,) from its time on, is the later one."""
+        innovation = innovation_of(later.pose, compose(earlier.pose, moved))
+        spread = later.covariance + earlier.covariance + _DRIFT
+        return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit
+
+    def _forget_rejected(self) -> None:
+        """Forget the rejected poses: a pose was fused, or the map's frame or the clock has changed."""
+        self._rejected.clear()
+        self.rejected_in_a_row = 0
 
     def _replace(self, index: int, measurement: PoseMeasurement) -> None:
         """Set the filter to a pose; the other poses of its entry and of later ones are forgotten."""

@@ -380,11 +380,10 @@ class RobotTracker:
         with self._state_lock:
             self.counts.overflow += 1
 
-    def record_backlog(self, behind: float, unpublished: int) -> None:
-        """Record how long samples had waited when they were taken, s, and how many updates were not published."""
+    def record_backlog(self, behind: float) -> None:
+        """Record how long samples had waited when they were taken, s."""
         with self._state_lock:
             self._behind = max(self._behind, behind)
-            self.counts.unpublished += unpublished
 
     def save(self) -> None:
         """Write the state, where it outlives the node."""
