@@ -288,10 +288,8 @@ _FOLLOWING = 1e-3  # share of a sample's delay that counts as the drift of the t
 def admit(reading: Reading, state: WheelState) -> list[WheelStep]:
     """Step 2: the steps that a reading makes: mostly one; none while it is refused or has to be confirmed."""
     counts, last, max_gap = state.counts, state.last, state.settings.max_gap
-    if last is None:  # the first step has no duration; from here on angles are counted if there are any, else rates
-        state.counting, state.on_time = reading.positions is not None, reading.arrival
-        state.count_from(reading.positions)
-        return [_taken(reading, 0.0, [0.0] * len(state.rates), reading.velocities or state.rates, 0.0, True, state)]
+    if last is None:
+        return [_step(reading, 0.0, state)]
     elapsed = (reading.stamp - last.stamp) / _SECOND
     if elapsed == 0 or (state.unconfirmed and reading.stamp == state.unconfirmed[-1].stamp):
         counts.duplicates += 1
@@ -346,15 +344,15 @@ def _waited_for(reading: Reading, state: WheelState) -> float:
 def _step(
     reading: Reading, elapsed: float, state: WheelState, *, silence: bool = False, restarted: bool = False
 ) -> WheelStep:
-    """The step to a reading ``elapsed`` s after the last one. silence: only the two ends of it are known."""
-    if silence:
-        state.counts.gaps += not restarted
-        state.on_time, rated, blind = reading.arrival, state.period, elapsed
+    """The step to a reading that is taken, ``elapsed`` s after the last one. silence: only its two ends are known."""
+    counts, positions, velocities, first = state.counts, reading.positions, reading.velocities, state.last is None
+    unseen, rated = elapsed, state.period  # s of which the path is not known, and for which rates stand
+    if first or silence:
+        counts.gaps += silence and not restarted
+        state.on_time = reading.arrival
     else:
-        elapsed, blind = _by_clocks(reading, elapsed, state)
+        elapsed, unseen = _by_clocks(reading, elapsed, state)
         rated = elapsed
-    state.late_in_a_row = 0
-    positions, velocities = reading.positions, reading.velocities
     rates = state.rates if velocities is None else velocities
     if state.counting and positions is not None and state.known is not None:
         expected = None if silence else [rate * elapsed for rate in rates]
@@ -362,15 +360,30 @@ def _step(
         # two that arrive at once tell no rate, and the ends of a silence only that of a sender without rates
         if (silence and velocities is None) or (not silence and elapsed >= 0.5 * state.period):
             rates = [angle / elapsed for angle in angles]
-        blind = elapsed if silence or not counted else 0.0
-    else:  # no angles to compare with: rates, or the last ones
-        angles, counted = [rate * min(rated, elapsed) for rate in rates], False
-        if positions is not None and (state.counting or velocities is None):
+        unseen = elapsed if silence or not counted else 0.0
+    else:  # no angles to compare with: rates, or the last ones; the first step has no duration
+        angles, counted = [rate * min(rated, elapsed) for rate in rates], first
+        if positions is not None and (first or state.counting or velocities is None):
             state.counting = True
             state.count_from(positions)
         elif state.known is not None:
             state.known = [known + angle for known, angle in zip(state.known, angles, strict=True)]
-    return _taken(reading, elapsed, angles, rates, blind, counted, state, restarted)
+    state.last, state.rates, state.repeats, state.late_in_a_row = reading, rates, 0, 0
+    counts.samples += 1
+    held = not first and state.old_steering > 0
+    counts.old_steering += held
+    return WheelStep(
+        reading.stamp,
+        elapsed,
+        np.array(angles),
+        np.array(rates),
+        elapsed if held else unseen,
+        counted,
+        restarted,
+        None if state.known is None else np.array(state.known),
+        None if reading.steering is None else np.array(reading.steering),
+        held,
+    )
 
 
 def _by_clocks(reading: Reading, elapsed: float, state: WheelState) -> tuple[float, float]:
@@ -408,30 +421,6 @@ def _by_clocks(reading: Reading, elapsed: float, state: WheelState) -> tuple[flo
     return elapsed, elapsed - state.period if elapsed > 1.7 * state.period else 0.0
 
 
-def _taken(
-    reading: Reading,
-    elapsed: float,
-    angles: list[float],
-    rates: list[float],
-    blind: float,
-    counted: bool,
-    state: WheelState,
-    restarted: bool = False,
-) -> WheelStep:
-    """The step of a reading that is taken, which becomes the last one."""
-    state.counts.samples += 1
-    state.repeats = 0
-    state.last, state.rates = reading, rates
-    held = elapsed > 0 and state.old_steering > 0
-    if held:
-        state.counts.old_steering += 1
-        blind = elapsed
-    known = None if state.known is None else np.array(state.known)
-    steering = None if reading.steering is None else np.array(reading.steering)
-    turned, turning = np.array(angles), np.array(rates)
-    return WheelStep(reading.stamp, elapsed, turned, turning, blind, counted, restarted, known, steering, held)
-
-
 # Share of its last reading below which a counter has restarted; chosen: a robot seldom drives back so near its start.
 _RESTARTED = 0.05
 _JITTER = 0.01  # s, by which stamps may be too close together; chosen
@@ -446,38 +435,36 @@ def unwrap(
     expected: angles by the rates; they stand in for a counter that restarted. None after a silence, in which turns may
     be lost and counters restarted.
     """
-    before, counts = state.known, state.counts
+    before, wrap = state.known, state.settings.wrap
     assert before is not None
-    angles = [position - known for position, known in zip(positions, before, strict=True)]
-    length = state.settings.wrap or _TURN
-    # Counters that wrap are brought nearest to what is expected. After a silence they do not tell how far the wheels
-    # went: the shortest way is taken.
-    nearest = expected or [0.0] * len(angles)
-    off = [angle - near for angle, near in zip(angles, nearest, strict=True)]
-    if max(map(abs, off)) > length / 2 and (expected is not None or state.wraps):
-        wraps = [round(each / length) for each in off]
-        if state.settings.wrap is None:  # a continuous joint of ROS 2 may wrap at a turn
-            stay = [far or abs(at) > _WITHIN_A_TURN for far, at in zip(state.beyond_a_turn, positions, strict=True)]
-            wraps = [0 if stays else number for stays, number in zip(stay, wraps, strict=True)]
-        if any(wraps):
-            counts.wraps += 1
-            state.wraps = True
-        angles = [angle - length * number for angle, number in zip(angles, wraps, strict=True)]
+    # A counter that wraps is brought nearest to what is expected; after a silence it does not tell how far the wheel
+    # went: the shortest way is taken. A continuous joint of ROS 2 may wrap at a turn.
+    length, may_wrap, wrapped, angles = wrap or _TURN, expected is not None or state.wraps, False, []
+    for wheel, (position, known) in enumerate(zip(positions, before, strict=True)):
+        angle = position - known
+        turns = round((angle - (expected[wheel] if expected else 0.0)) / length) if may_wrap else 0
+        if turns and (wrap is not None or not (state.beyond_a_turn[wheel] or abs(position) > _WITHIN_A_TURN)):
+            angle -= length * turns
+            state.wraps = wrapped = True
+        angles.append(angle)
+    state.counts.wraps += wrapped
     state.count_from(positions)
     farthest = max(map(abs, angles))
     if expected is not None:
-        limit = state.max_rate * max(elapsed, _JITTER)
-        if farthest <= limit:
-            state.fastest = max(state.fastest, farthest / max(elapsed, _JITTER))
+        span = max(elapsed, _JITTER)
+        if farthest <= state.max_rate * span:
+            state.fastest = max(state.fastest, farthest / span)
             return angles, True
-        counts.counter_restarts += 1
-        return [near if abs(angle) > limit else angle for near, angle in zip(expected, angles, strict=True)], False
+        state.counts.counter_restarts += 1
+        return [
+            near if abs(angle) > state.max_rate * span else angle for near, angle in zip(expected, angles, strict=True)
+        ], False
     limit = (_FASTER * state.fastest or state.max_rate) * elapsed + math.pi
     far = [(at, known) for at, known in zip(positions, before, strict=True) if abs(known) > math.pi]
     if farthest > limit or (far and all(abs(at) < _RESTARTED * abs(known) for at, known in far)):
-        counts.counter_restarts += 1
+        state.counts.counter_restarts += 1
         return [0.0] * len(angles), False
-    turns_may_be_lost = state.settings.wrap is not None or not all(state.beyond_a_turn)
+    turns_may_be_lost = wrap is not None or not all(state.beyond_a_turn)
     return angles, not (turns_may_be_lost and limit > length / 2 + math.pi)
 
 
