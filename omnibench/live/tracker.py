@@ -24,7 +24,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from omnibench.errors import DataError, OmnibenchError
-from omnibench.live.fusion import Entry, Fusion, FusionSettings, Outcome, PoseInput, ReferenceCorrection, Timeline
+from omnibench.live.fusion import (
+    Entry,
+    Estimate,
+    Fusion,
+    FusionSettings,
+    Outcome,
+    PoseInput,
+    ReferenceCorrection,
+    Timeline,
+)
 from omnibench.live.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.odometry import ExtrapolationMonitor, LiveOdometry, Motion
 from omnibench.live.state import RobotMemory, SavedState
@@ -71,7 +80,7 @@ class PublishedStamps:
 
 
 _HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
-_UNKNOWN = np.zeros((3, 3))  # covariance of a pose in the map where there is no fusion
+_NO_ESTIMATE = Estimate(np.zeros(3), np.zeros((3, 3)))  # where there is no fusion
 _RATE_WINDOW = 0.9  # s, over which samples are counted at least; below the period of the diagnostics, 1 s
 _BEHIND = 0.1  # s that samples may wait; a node whose samples wait for longer cannot keep up; chosen
 _SAVE_PERIOD = 0.1  # s between two saved states; chosen: a node that is killed loses no more
@@ -172,7 +181,7 @@ class RobotTracker:
                 if self._guessed_angles and step.positions is None:
                     self._warn_of_guessed_angles()
                 if fusion is not None and fusion.located:
-                    odometry.set_odom_heading(float(fusion.pose[2] - odometry.pose[2]))
+                    odometry.set_odom_heading(float(fusion.estimate.pose[2] - odometry.pose[2]))
                 motion = odometry.step(step)
                 self._monitor.take(step, odometry.driven)
                 # 4. Predict the pose in the map.
@@ -182,8 +191,8 @@ class RobotTracker:
                     timeline.restart(motion.stamp - round(motion.duration * _SECOND))
                     if fusion is not None:
                         fusion.restart()
-                pose, covariance = (odometry.pose, _UNKNOWN) if fusion is None else fusion.predict(motion)
-                timeline.append(Entry(motion.stamp, motion, odometry.pose, pose, covariance))
+                estimate = _NO_ESTIMATE if fusion is None else fusion.predict(motion)
+                timeline.append(Entry(motion.stamp, motion, odometry.pose, estimate))
                 # 5. Fuse the poses of SLAM that waited for this time.
                 if fusion is not None:
                     fusion.take_waiting()
@@ -195,7 +204,7 @@ class RobotTracker:
                         odometry.covariance,
                         odometry.twist,
                         odometry.twist_covariance,
-                        None if fusion is None else (fusion.pose, fusion.covariance),
+                        None if fusion is None else fusion.estimate,
                     )
                 )
             if updates:
@@ -238,7 +247,7 @@ class RobotTracker:
             status, message = self._status(now, age, behind)
             # Covariance of the fused pose, or of odometry's; it grows in a silence of the wheels.
             fusion, odometry = self._fusion, self._odometry
-            covariance = odometry.covariance if fusion is None else fusion.covariance
+            covariance = odometry.covariance if fusion is None else fusion.estimate.covariance
             if status == "stale" and age is not None:
                 covariance = covariance + odometry.silence_covariance(age)
             provenance = self.calibration.provenance
@@ -317,7 +326,7 @@ class RobotTracker:
             try:
                 _check_same_robot(calibration, self.calibration)
                 odometry = self._odometry.continued(calibration)
-                reference = self._reference.continued(calibration.model)
+                reference = ReferenceCorrection(calibration.model, self._reference.start)
             except OmnibenchError as error:
                 self._record_refused_swap(calibration.name, str(error))
                 raise DataError(str(error)) from None
@@ -342,7 +351,7 @@ class RobotTracker:
         """Forget the pose in the map; odometry continues. DataError without fusion."""
         with self._state_lock:
             self._required_fusion("reset").reset()
-            self._reference.restart()
+            self._reference.start = None  # the next pose is the first of another run
 
     def resume(self, saved: SavedState, now: float, wall: float) -> None:
         """Continue where another node stopped. now, wall: monotonic and unix time, s.
@@ -364,11 +373,11 @@ class RobotTracker:
             steered = None if steering is None else np.array(steering)
             odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time, steered)
             if fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
-                fusion.begin(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
+                fusion.set_pose(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
             self._stamps.unique(saved.stamp)
             motion = Motion(saved.stamp, 0.0, np.zeros(3), self.calibration.integration, 0.0, 0.0)
-            pose, covariance = (odometry.pose, _UNKNOWN) if fusion is None else (fusion.pose, fusion.covariance)
-            self._timeline.append(Entry(saved.stamp, motion, odometry.pose, pose, covariance))
+            estimate = _NO_ESTIMATE if fusion is None else fusion.estimate
+            self._timeline.append(Entry(saved.stamp, motion, odometry.pose, estimate))
 
     def count_failure(self) -> None:
         """Count a message on which omnibench itself failed."""
@@ -405,7 +414,7 @@ class RobotTracker:
         if self._memory is None or last is None or self._arrival is None:
             return
         self._save_due = self._arrival + _SAVE_PERIOD
-        fused = (fusion.pose, fusion.covariance) if fusion is not None and fusion.located else (None, None)
+        fused = fusion.estimate if fusion is not None and fusion.located else (None, None)
         saved = SavedState.model_construct(  # not validated: reading refuses numbers that cannot be
             stamp=last.stamp,
             wall=time.time() - (time.monotonic() - self._arrival),
