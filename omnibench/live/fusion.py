@@ -241,9 +241,9 @@ class FusionSettings(Model):
 class Fusion:
     """Pose of one robot in the map, by a Kalman filter over its timeline.
 
-    estimate: now. located: True once a pose or an order has said where the robot is. outcome: of the pose that was
-    taken last. fused_at: arrival of the last pose that was fused, s, monotonic; None since a reset. rejected_in_a_row:
-    poses that the gate rejected since one was fused.
+    estimate: now; ``predict`` brings it to the next sample. located: True once a pose or an order has said where the
+    robot is. outcome: of the pose that was taken last. fused_at: arrival of the last pose that was fused, s, monotonic;
+    None since a reset. rejected_in_a_row: poses that the gate rejected since one was fused.
     """
 
     def __init__(self, settings: FusionSettings, timeline: Timeline, counts: Counts) -> None:
@@ -260,11 +260,6 @@ class Fusion:
         self.located = False
         self.outcome: Outcome | None = None
         self.fused_at: float | None = None
-
-    def predict(self, motion: Motion) -> Estimate:
-        """The estimate after a motion, for the new entry of the timeline."""
-        self.estimate = predict(self.estimate, motion)
-        return self.estimate
 
     def take_waiting(self) -> None:
         """Fuse the poses that came before the wheel samples of their time, if these are there now."""

@@ -349,59 +349,23 @@ def low_latency() -> Iterator[None]:
                 sys.setswitchinterval(_usual_interval)
 
 
-def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
-    """The tracker of one robot; with a memory it goes on where the last run stopped.
-
-    ConfigError or DataError: the calibration cannot be read, or the joints are not one for each wheel.
-    """
-    calibration = read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration)
-    tracker = RobotTracker(
-        robot.name,
-        calibration,
-        wheels=robot.wheels,
-        fusion=config.fusion_of(robot),
-        frames=config.frames_of(robot),
-        stale_after=config.stale_after,
-        memory=memory,
-    )
-    saved = None if memory is None else memory.load()
-    if saved is not None:
-        tracker.resume(saved, time.monotonic(), time.time())
-        x, y, _ = saved.pose
-        LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, x, y)
-    return tracker
-
-
 _PERIOD = 1.0  # s, as ROS 2's diagnostics usually come
 
 
-class DiagnosticsTimer:
-    """Calls the services' ``publish_diagnostics`` once a second, in a thread of its own, until ``close``.
+def publish_diagnostics(services: Sequence[RobotService], stop: threading.Event) -> None:
+    """Publish the services' diagnostics once a second until stopped.
 
     A robot whose diagnostics fail does not stop those of the others; each kind of its errors is logged once.
     """
-
-    def __init__(self, services: Sequence[RobotService]) -> None:
-        self._services = services
-        self._log_limiter = RateLimiter(math.inf)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="diagnostics", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Publish no more."""
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stop.wait(_PERIOD):
-            for service in self._services:
-                try:
-                    service.publish_diagnostics()
-                except Exception as error:
-                    name, kind = service.tracker.name, type(error).__name__
-                    if self._log_limiter.allows(f"{name} {kind}"):
-                        LOG.error("%s: diagnostics: %s: %s", name, kind, one_line(str(error)))
+    log_limiter = RateLimiter(math.inf)
+    while not stop.wait(_PERIOD):
+        for service in services:
+            try:
+                service.publish_diagnostics()
+            except Exception as error:
+                name, kind = service.tracker.name, type(error).__name__
+                if log_limiter.allows(f"{name} {kind}"):
+                    LOG.error("%s: diagnostics: %s: %s", name, kind, one_line(str(error)))
 
 
 _PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, which mostly come at once; chosen
@@ -426,9 +390,7 @@ class LiveNode(Closing):
                 for robot in config.robots:
                     memories[robot.name] = memory = RobotMemory(config.state, robot.name)
                     started.callback(memory.close)
-            self.trackers = {
-                robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
-            }
+            self.trackers = {robot.name: self._tracker(robot, memories.get(robot.name)) for robot in config.robots}
             self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
             self._claim_robots(started)
@@ -446,7 +408,12 @@ class LiveNode(Closing):
             self._record(listeners)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
-            started.callback(DiagnosticsTimer(services).close)
+            stopped = threading.Event()
+            arguments = services, stopped
+            diagnostics = threading.Thread(target=publish_diagnostics, args=arguments, name="diagnostics", daemon=True)
+            diagnostics.start()
+            started.callback(diagnostics.join)
+            started.callback(stopped.set)
             started.enter_context(low_latency())
             self._started = started.pop_all()
 
@@ -457,6 +424,22 @@ class LiveNode(Closing):
     def health(self, robot: str) -> Health:
         """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
+
+    def _tracker(self, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
+        """The tracker of one robot; with a memory it goes on where the last run stopped."""
+        tracker = RobotTracker(
+            robot.name,
+            read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration),
+            wheels=robot.wheels,
+            fusion=self.config.fusion_of(robot),
+            frames=self.config.frames_of(robot),
+            stale_after=self.config.stale_after,
+            memory=memory,
+        )
+        if memory is not None and (saved := memory.load()) is not None:
+            tracker.resume(saved, time.monotonic(), time.time())
+            LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, *saved.pose[:2])
+        return tracker
 
     def _claim_robots(self, started: ExitStack) -> None:
         """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""

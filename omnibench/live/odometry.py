@@ -103,6 +103,7 @@ class LiveOdometry:
         self._standstill = standstill
         self._calibration = calibration
         mount, self._drive = calibration.robot.mount, calibration.robot.drive
+        self._direct = self._drive.direct
         self._centre = None if mount is None else RobotCentre(mount)
         self.session_time = 0.0
         self._stream = self._new_stream(self.session_time)
@@ -225,7 +226,7 @@ class LiveOdometry:
         self._recent.append(step)
         # Twist at the end of the step, and its variances by the matrix's covariance
         if duration > 0:
-            if self._drive.direct:
+            if self._direct:
                 rates = step.rates
             elif not step.blind:
                 rates = stream.driven / duration
@@ -313,47 +314,38 @@ class ExtrapolationMonitor:
     """
 
     def __init__(self, robot: str, calibration: Calibration) -> None:
-        self._robot, self._calibration = robot, calibration
+        self._robot, self._calibration, self._matrix = robot, calibration, calibration.matrix_array
         self._domain: TrainingDomain | None = None
         self.seconds: float | None = None
         if calibration.effects and calibration.driven:
             self._domain, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
-        self._matrix = calibration.matrix_array
         self._lasted = 0.0  # s that the robot has now been outside the domain without a break
-        self._driven: Array = np.zeros(self._matrix.shape[1])  # rad, integrals of the signals in the present window
-        self._elapsed = 0.0  # s since the present window began
+        # rad, integrals of the signals in the present window, and s since it began
+        self._driven, self._elapsed = np.zeros(self._matrix.shape[1]), 0.0
 
     def take(self, step: WheelStep, driven: Array) -> None:
         """Take a wheel step with the integrals (M,) of its drive signals, rad."""
-        if self._domain is None:
+        if self._domain is None or self.seconds is None:
             return
+        driven, elapsed = self._driven + driven, self._elapsed + step.duration
+        if not step.blind and elapsed < _WINDOW:
+            self._driven, self._elapsed = driven, elapsed
+            return
+        self._driven, self._elapsed = np.zeros(len(driven)), 0.0
         if step.blind:  # its motion is not known
-            self._begin()
             return
-        self._driven = self._driven + driven
-        self._elapsed += step.duration
-        if self._elapsed >= _WINDOW:
-            self._judge(self._domain, self._matrix @ self._driven / self._elapsed)
-            self._begin()
-
-    def _begin(self) -> None:
-        self._driven = np.zeros(self._matrix.shape[1])
-        self._elapsed = 0.0
-
-    def _judge(self, domain: TrainingDomain, motion: Array) -> None:
-        if not domain.is_outside(motion):
+        motion = self._matrix @ driven / elapsed
+        if not self._domain.is_outside(motion):
             self._lasted = 0.0
             return
-        before, self._lasted = self._lasted, self._lasted + self._elapsed
+        before, self._lasted = self._lasted, self._lasted + elapsed
         if self._lasted <= _TRANSITION:
             return
-        assert self.seconds is not None
         if not self.seconds:
+            names, fading = [term.name for term in self._calibration.effects], self._calibration.plain is not None
             LOG.warning(
                 "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
-                *(self._robot, self._calibration.name, domain.in_words(motion[None])),
-                extrapolation_consequence(
-                    [term.name for term in self._calibration.effects], fading=self._calibration.plain is not None
-                ),
+                *(self._robot, self._calibration.name, self._domain.in_words(motion[None])),
+                extrapolation_consequence(names, fading=fading),
             )
-        self.seconds += self._lasted if before <= _TRANSITION else self._elapsed
+        self.seconds += self._lasted if before <= _TRANSITION else elapsed

@@ -33,6 +33,7 @@ from omnibench.live.fusion import (
     PoseInput,
     ReferenceCorrection,
     Timeline,
+    predict,
 )
 from omnibench.live.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.odometry import ExtrapolationMonitor, LiveOdometry, Motion
@@ -183,7 +184,8 @@ class RobotTracker:
                 if fusion is not None and fusion.located:
                     odometry.set_odom_heading(float(fusion.estimate.pose[2] - odometry.pose[2]))
                 motion = odometry.step(step)
-                self._monitor.take(step, odometry.driven)
+                if self._monitor.seconds is not None:
+                    self._monitor.take(step, odometry.driven)
                 # 4. Predict the pose in the map.
                 if motion.restarted and timeline.entries:
                     # the clock jumped: the motion counts as if it ended at the new time, and times before it have no
@@ -191,7 +193,9 @@ class RobotTracker:
                     timeline.restart(motion.stamp - round(motion.duration * _SECOND))
                     if fusion is not None:
                         fusion.restart()
-                estimate = _NO_ESTIMATE if fusion is None else fusion.predict(motion)
+                estimate = _NO_ESTIMATE
+                if fusion is not None:
+                    estimate = fusion.estimate = predict(fusion.estimate, motion)
                 timeline.append(Entry(motion.stamp, motion, odometry.pose, estimate))
                 # 5. Fuse the poses of SLAM that waited for this time.
                 if fusion is not None:

@@ -142,6 +142,7 @@ class WheelState:
         self.learnt: list[float] = []  # periods
         self.after_missing = 0  # samples in a row, each after a missing one
         self.stamped, self.waited = 1.0, 1.0  # s by stamps and by this machine's clock, recent ones weighing most
+        self.pace = 1.0  # of the stamps, by this machine's clock: 1 of a robot, and more of a fast replay
         self.on_time = 0.0  # s, when the last sample would have come without the delays that others did not have
 
     @property
@@ -149,11 +150,6 @@ class WheelState:
         """Age of the last sample's steering angles, s, where that is more than it may be; else 0."""
         age = 0.0 if self.last is None else self.last.steering_age
         return age if age > self.settings.max_steering_age else 0.0
-
-    @property
-    def pace(self) -> float:
-        """Time by the stamps per time by this machine's clock: 1 of a robot, and more of a fast replay."""
-        return self.stamped / self.waited if self.waited > 1e-6 else 1e6
 
     def refuse(self, counter: str, reason: str) -> None:
         """Count a message, or an angle of it, that is refused for a reason."""
@@ -296,7 +292,8 @@ def admit(reading: Reading, state: WheelState) -> list[WheelStep]:
         state.repeats, state.repeated_at = state.repeats + 1, reading.arrival
         return []
     if 0 < elapsed <= max_gap:
-        _drop_unconfirmed(state)
+        if state.unconfirmed:
+            _drop_unconfirmed(state)
         return [_step(reading, elapsed, state)]
     if -REORDERED <= elapsed < 0:
         counts.late += 1
@@ -370,7 +367,7 @@ def _step(
             state.known = [known + angle for known, angle in zip(state.known, angles, strict=True)]
     state.last, state.rates, state.repeats, state.late_in_a_row = reading, rates, 0, 0
     counts.samples += 1
-    held = not first and state.old_steering > 0
+    held = not first and reading.steering_age > state.settings.max_steering_age
     counts.old_steering += held
     return WheelStep(
         reading.stamp,
@@ -404,6 +401,7 @@ def _by_clocks(reading: Reading, elapsed: float, state: WheelState) -> tuple[flo
     bunched = state.settings.stamps == "arrival"  # the time between two then tells no period
     state.stamped = _MEMORY * state.stamped + elapsed
     state.waited = _MEMORY * state.waited + (reading.arrival - state.last.arrival)
+    state.pace = state.stamped / state.waited if state.waited > 1e-6 else 1e6
     if len(state.learnt) < _LEARNING and not bunched:
         counts.missing += skipped
         state.learnt.append(elapsed / (1 + skipped))

@@ -73,7 +73,7 @@ class Robot:
         return self
 
     def _append(self, moved: Motion) -> None:
-        estimate = self.fusion.predict(moved)
+        estimate = self.fusion.estimate = pose_fusion.predict(self.fusion.estimate, moved)
         self.timeline.append(pose_fusion.Entry(moved.stamp, moved, self.truth[-1], estimate))
         self.fusion.take_waiting()
 
