@@ -242,7 +242,7 @@ class RobotService:
         if self._scheduled:
             return
         self._scheduled = True
-        # To acknowledge a flow may declare publishers and wait for a disk, which is nothing for Zenoh's thread.
+        # Messages of a flow are taken together, so that one saved state and one acknowledgement stand for many.
         if flow is None and not self._intake.busy and self._working.acquire(blocking=False):
             try:
                 self._intake.run(self._take_waiting)
@@ -278,7 +278,7 @@ class RobotService:
                 continue
             self._receive_poses()
             if self._flows.accepts(message.flow):
-                self._take(message, late=False, published=self._flows.inherited(message.flow), replayed=True)
+                self._take(message, published=self._flows.inherited(message.flow), replayed=True)
         self._late.publish()
         if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
             self.tracker.save()
@@ -291,7 +291,13 @@ class RobotService:
             self._intake.queue(self._take_turn)
 
     def _take(
-        self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0, replayed: bool = False
+        self,
+        message: _Message,
+        *,
+        late: bool = False,
+        published: bool = False,
+        skipped: int = 0,
+        replayed: bool = False,
     ) -> None:
         """Take a message, and publish its updates unless it is late, or they may be published already.
 
