@@ -439,16 +439,16 @@ class PoseInput:
         except MessageError:
             self._counts.pose_undecodable += 1
             raise
-        try:
-            if message.frame not in ("", self._frame):
-                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frame!r}")
-            if not np.isfinite(message.pose).all():
-                raise MessageError("the pose is not finite")
-            if np.abs(message.pose[:2]).max() > _FARTHEST:
-                raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
-        except MessageError:
+        fault = ""
+        if message.frame not in ("", self._frame):
+            fault = f"the pose is in frame {message.frame!r}, not in {self._frame!r}"
+        elif not np.isfinite(message.pose).all():
+            fault = "the pose is not finite"
+        elif np.abs(message.pose[:2]).max() > _FARTHEST:
+            fault = f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away"
+        if fault:
             self._counts.pose_invalid += 1
-            raise
+            raise MessageError(fault)
         by_arrival = self._settings.stamps == "arrival" and not replayed
         stamp = arrival_stamp(arrival) if by_arrival else message.stamp
         return PoseMeasurement(stamp, message.pose, self._covariance(message, calibration), arrival)

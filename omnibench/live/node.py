@@ -234,7 +234,7 @@ class RobotService:
             full = len(self._waiting) >= _LONGEST_QUEUE or self._waiting_bytes + len(payload) > _LARGEST_QUEUE
             self._waiting_bytes += 0 if full else len(payload)
         if full:
-            self.tracker.count_overflow()
+            self.tracker.count("overflow")
             return
         content = None if attachment is None else attachment.to_bytes()
         flow = flow_of(content)
@@ -266,43 +266,35 @@ class RobotService:
     def _take_waiting(self) -> None:
         """Take the messages that wait, at most a batch; by who holds ``_working``."""
         self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
-        behind, size = 0.0, 0
+        behind = 0.0
         for _ in range(min(len(self._waiting), _BATCH)):
             message = self._waiting.popleft()
-            size += len(message.payload)
+            with self._counting:
+                self._waiting_bytes -= len(message.payload)
             if message.flow is None:
                 waited = time.monotonic() - message.arrival
                 behind = max(behind, waited)
                 skipped = 0 if message.is_pose else self._missed.take(message.attachment) or 0
-                self._take(message, late=waited > LATE, skipped=skipped)
+                self._take(message, skipped, late=waited > LATE)
                 continue
             self._receive_poses()
             if self._flows.accepts(message.flow):
-                self._take(message, published=self._flows.inherited(message.flow), replayed=True)
+                self._take(message, published=self._flows.inherited(message.flow))
         self._late.publish()
         if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
             self.tracker.save()
             self._flows.acknowledge()
         self.tracker.record_backlog(behind)
-        with self._counting:
-            self._waiting_bytes -= size
         if self._waiting and not self._scheduled:
             self._scheduled = True
             self._intake.queue(self._take_turn)
 
-    def _take(
-        self,
-        message: _Message,
-        *,
-        late: bool = False,
-        published: bool = False,
-        skipped: int = 0,
-        replayed: bool = False,
-    ) -> None:
+    def _take(self, message: _Message, skipped: int = 0, *, late: bool = False, published: bool = False) -> None:
         """Take a message, and publish its updates unless it is late, or they may be published already.
 
-        skipped: messages before it that never came, by the sender's numbers. replayed: it comes in a flow.
+        skipped: messages before it that never came, by the sender's numbers.
         """
+        replayed = message.flow is not None
         try:
             if message.is_pose:
                 self.tracker.take_pose(message.payload, message.arrival, replayed=replayed)
@@ -316,7 +308,7 @@ class RobotService:
                 self._late.publish(updates)
         except Exception as error:  # the stream has to go on
             input_name = "pose" if message.is_pose else "wheels"
-            self.tracker.count_failure()
+            self.tracker.count("failures")
             if self._rate_limiter.allows(input_name):
                 LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, input_name, type(error).__name__, error)
 

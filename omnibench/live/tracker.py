@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from itertools import count
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -180,7 +180,9 @@ class RobotTracker:
             for step in steps:
                 # 3. Integrate odometry and its covariance.
                 if self._guessed_angles and step.positions is None:
-                    self._warn_of_guessed_angles()
+                    acts = f"{self.name}: {self._guessed_angles} acts by wheel angles"
+                    LOG.warning("%s, and the messages tell none: they are counted from 0, at a guess", acts)
+                    self._guessed_angles = ""
                 if fusion is not None and fusion.located:
                     odometry.set_odom_heading(float(fusion.estimate.pose[2] - odometry.pose[2]))
                 motion = odometry.step(step)
@@ -254,7 +256,14 @@ class RobotTracker:
             covariance = odometry.covariance if fusion is None else fusion.estimate.covariance
             if status == "stale" and age is not None:
                 covariance = covariance + odometry.silence_covariance(age)
-            provenance = self.calibration.provenance
+            provenance, fusion_health = self.calibration.provenance, None
+            if fusion is not None:
+                fusion_health = FusionHealth(
+                    located=fusion.located,
+                    pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
+                    last_outcome=fusion.outcome,
+                    rejected_in_a_row=fusion.rejected_in_a_row,
+                )
             return Health(
                 robot=self.name,
                 status=status,
@@ -267,14 +276,7 @@ class RobotTracker:
                 last_stamp=self._timeline.newest / _SECOND if self._timeline.entries else None,
                 position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
                 heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
-                fusion=None
-                if fusion is None
-                else FusionHealth(
-                    located=fusion.located,
-                    pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
-                    last_outcome=fusion.outcome,
-                    rejected_in_a_row=fusion.rejected_in_a_row,
-                ),
+                fusion=fusion_health,
                 counts=self.counts.as_dict(),
                 last_refusal=self._last_refusal,
                 last_swap=self._last_swap,
@@ -326,25 +328,26 @@ class RobotTracker:
 
         DataError: it is not this robot's, or cannot be run.
         """
-        with self._state_lock:
-            try:
+        try:
+            with self._state_lock:
                 _check_same_robot(calibration, self.calibration)
                 odometry = self._odometry.continued(calibration)
-                reference = ReferenceCorrection(calibration.model, self._reference.start)
-            except OmnibenchError as error:
-                self._record_refused_swap(calibration.name, str(error))
-                raise DataError(str(error)) from None
-            self.calibration, self._odometry, self._reference = calibration, odometry, reference
-            self._monitor = ExtrapolationMonitor(self.name, calibration)
-            self._guessed_angles = _wheel_angle_effects(calibration)
-            self.counts.swaps += 1
-            self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
-            self._save()
+                self._reference = ReferenceCorrection(calibration.model, self._reference.start)
+                self.calibration, self._odometry = calibration, odometry
+                self._monitor = ExtrapolationMonitor(self.name, calibration)
+                self._guessed_angles = _wheel_angle_effects(calibration)
+                self.counts.swaps += 1
+                self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
+                self._save()
+        except OmnibenchError as error:
+            self.refuse_swap(str(error), calibration.name)
+            raise DataError(str(error)) from None
 
-    def refuse_swap(self, reason: str) -> None:
-        """Count a calibration that was sent and cannot be read."""
+    def refuse_swap(self, reason: str, name: str | None = None) -> None:
+        """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
         with self._state_lock:
-            self._record_refused_swap(None, reason)
+            self.counts.swaps_refused += 1
+            self._last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose (3,) in the map, now. DataError without fusion: odometry itself never jumps."""
@@ -383,15 +386,10 @@ class RobotTracker:
             estimate = _NO_ESTIMATE if fusion is None else fusion.estimate
             self._timeline.append(Entry(saved.stamp, motion, odometry.pose, estimate))
 
-    def count_failure(self) -> None:
-        """Count a message on which omnibench itself failed."""
+    def count(self, counter: Literal["failures", "overflow"]) -> None:
+        """Count a message on which omnibench itself failed, or one that had no place among those that wait."""
         with self._state_lock:
-            self.counts.failures += 1
-
-    def count_overflow(self) -> None:
-        """Count a message that was not taken, because too many were waiting."""
-        with self._state_lock:
-            self.counts.overflow += 1
+            setattr(self.counts, counter, getattr(self.counts, counter) + 1)
 
     def record_backlog(self, behind: float) -> None:
         """Record how long samples had waited when they were taken, s."""
@@ -442,18 +440,6 @@ class RobotTracker:
         """Remember why a message was refused."""
         self.refusals += 1
         self._last_refusal = reason
-
-    def _record_refused_swap(self, name: str | None, reason: str) -> None:
-        """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
-        self.counts.swaps_refused += 1
-        self._last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
-
-    def _warn_of_guessed_angles(self) -> None:
-        LOG.warning(
-            "%s: %s acts by wheel angles, and the messages tell none: they are counted from 0, at a guess",
-            *(self.name, self._guessed_angles),
-        )
-        self._guessed_angles = ""
 
     def _required_fusion(self, order: str) -> Fusion:
         """The fusion that an order needs. order: its name, for messages. DataError: there is no fusion."""
