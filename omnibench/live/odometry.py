@@ -260,10 +260,10 @@ class LiveOdometry:
             slopes = np.array([[cosine, -sine, -half * along_y], [sine, cosine, half * along_x], [0.0, 0.0, 1.0]])
             if self._elements is not None:
                 # Eq. (L3): row 3 turns this step by the heading's error so far, and by half of the turn in the step
-                jacobian, turned = self._jacobian, self._jacobian[2, 2]
-                jacobian[0, 2] -= along_y * turned
-                jacobian[1, 2] += along_x * turned
-                jacobian += slopes[:, :, None] * stream.driven
+                x_by_row_3, y_by_row_3, turned = self._jacobian[:, 2]
+                x_by_row_3 -= along_y * turned
+                y_by_row_3 += along_x * turned
+                self._jacobian += slopes[:, :, None] * stream.driven
             if doubts is not None and self._doubts is None:
                 self._doubts = np.zeros_like(doubts)
             if self._doubts is not None:  # Eq. (L4)
