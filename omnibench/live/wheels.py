@@ -179,7 +179,7 @@ class WheelState:
 def decode(
     message: JointState, arrival: float, state: WheelState, skipped: int = 0, *, replayed: bool = False
 ) -> Reading | None:
-    """Step 1: check a message and take its values; None if it is refused, or holds steering joints alone.
+    """Check a message and take its values; None if it is refused, or holds steering joints alone.
 
     arrival: s, monotonic. skipped: messages before it that never came, by the sender's numbers. replayed: its stamp
     counts in any case.
@@ -282,7 +282,7 @@ _FOLLOWING = 1e-3  # share of a sample's delay that counts as the drift of the t
 
 
 def admit(reading: Reading, state: WheelState) -> list[WheelStep]:
-    """Step 2: the steps that a reading makes: mostly one; none while it is refused or has to be confirmed."""
+    """The steps that a reading makes, by its stamp: mostly one; none while it is refused or has to be confirmed."""
     counts, last, max_gap = state.counts, state.last, state.settings.max_gap
     if last is None:
         return [_step(reading, 0.0, state)]
@@ -428,7 +428,7 @@ _FASTER = 1.5  # times the fastest rate so far is the fastest that is believed o
 def unwrap(
     positions: list[float], expected: list[float] | None, elapsed: float, state: WheelState
 ) -> tuple[list[float], bool]:
-    """Step 3: angles since the last reading, rad, and True if they hold the whole motion of ``elapsed`` s.
+    """Angles since the last reading, rad, and True if they hold the whole motion of ``elapsed`` s.
 
     expected: angles by the rates; they stand in for a counter that restarted. None after a silence, in which turns may
     be lost and counters restarted.
