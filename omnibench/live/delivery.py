@@ -68,17 +68,8 @@ class Delivery(Closing):
         self._retry = _FIRST_RETRY
         self._gap = False
         self._node: str | None = None  # the node's session, as its acknowledgements name it
-        self._before = 0  # messages before the last round trip
-        self._back = threading.Event()  # no round trip is under way
-        self._back.set()
-        self._linked = False  # when the last round trip began; otherwise all subscribers are in this session
         self._flow = secrets.randbits(64)
         self._subscriber = session.declare_subscriber(_key(robot, self._flow), direct(self._take_acknowledgement))
-
-    @property
-    def taken(self) -> int | None:
-        """Messages that the robot's node has taken; None if no node acknowledges them."""
-        return self.passed if self.acknowledged else None
 
     def put(self, publisher: Publisher[Any], payload: bytes) -> bool:
         """Publish a payload as soon as there is room for it; False if ``stop`` was set before.
@@ -88,9 +79,10 @@ class Delivery(Closing):
         began = time.monotonic()
         # Wait while the window is full, or while the node has been silent for long.
         while not self._stop.is_set() and (
-            self._look(WINDOW // 2) >= WINDOW or (self.acknowledged and (self._gap or self._silence() >= _FIRST_RETRY))
+            self._look(WINDOW) >= WINDOW or self._gap or (self.acknowledged and self._silence() >= _FIRST_RETRY)
         ):
-            self._wait()
+            self._wait(self._sign)
+            self._sign.clear()
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0
         if self._stop.is_set():
@@ -107,8 +99,10 @@ class Delivery(Closing):
     def finish(self) -> None:
         """Wait until all has arrived, or a short time if ``stop`` is set. DeliveryError: the receiver is given up."""
         while self._look(1) and not self._stop.is_set():
-            self._wait()
-        wait_until(lambda: not self._look(1), _FIRST_RETRY)  # after a stop what is under way may still arrive
+            self._wait(self._sign)
+            self._sign.clear()
+        # After a stop what is under way may still arrive.
+        wait_until(lambda: not (self._under_way and self.acknowledged), _FIRST_RETRY)
 
     def close(self) -> None:
         """Take no more acknowledgements."""
@@ -118,11 +112,10 @@ class Delivery(Closing):
         """Time since the last progress of what is under way, s."""
         return time.monotonic() - self._progress_at if self._under_way else 0.0
 
-    def _wait(self) -> None:
+    def _wait(self, sign: threading.Event) -> None:
         """Wait for a sign of the receiver for a moment. DeliveryError: there was none for too long."""
         began = time.monotonic()
-        self._sign.wait(_POLL_PERIOD)
-        self._sign.clear()
+        sign.wait(_POLL_PERIOD)
         self._waited += min(time.monotonic() - began, _LONGEST_POLL)
         if self._waited > self._patience:
             who, rights = "its node" if self.acknowledged else "the router", ""
@@ -132,14 +125,11 @@ class Delivery(Closing):
             raise DeliveryError(f"{silence}{rights}; `wait` says how long to wait")
 
     def _look(self, least: int) -> int:
-        """Number of messages under way, after a look at what has passed and at what seems lost.
-
-        least: number of messages that are worth a round trip.
-        """
+        """Number of messages under way, after what seems lost was sent again, or ``least`` made a round trip."""
         if self.acknowledged:
             self._send_again()
-        elif self._back.is_set() and len(self._under_way) >= least:
-            self._make_round_trip(least)
+        elif len(self._under_way) >= least:
+            self._make_round_trip()
         return len(self._under_way)
 
     def _send_again(self) -> None:
@@ -158,24 +148,19 @@ class Delivery(Closing):
                 return
             publisher.put_numbered(payload, number, (self._flow, place, self.passed, True))
 
-    def _make_round_trip(self, least: int) -> None:
-        """Count what was sent before the last query as passed, and query again if ``least`` messages are under way."""
-        was_linked, self._linked = self._linked, is_connected(self._session)
-        if was_linked and not self._linked and not self._stop.is_set():
+    def _make_round_trip(self) -> None:
+        """Wait until the router closes a query that follows all messages. DeliveryError: it does not, or it is gone."""
+        linked, closed = is_connected(self._session), threading.Event()
+        handler: Any = zenoh.handlers.Callback(lambda _: None, closed.set, indirect=False)
+        # Zenoh closes the query at its timeout too, which must come after our patience
+        options: dict[str, Any] = {"timeout": 2 * self._patience, "priority": zenoh.Priority.BACKGROUND}
+        self._session.get(_key(self._robot, "nobody"), handler, **options)
+        while not closed.is_set() and not self._stop.is_set():
+            self._wait(closed)
+        if linked and not is_connected(self._session) and not self._stop.is_set():
             raise DeliveryError("the link to the router was lost")  # which closes a query, too
-        self._pass(self._before)
-        if len(self._under_way) >= least:
-            self._before = self.passed + len(self._under_way)
-            self._back.clear()
-            handler: Any = zenoh.handlers.Callback(lambda _: None, self._take_return, indirect=False)
-            # Zenoh closes the query at its timeout too, which must come after our patience
-            options: dict[str, Any] = {"timeout": 2 * self._patience, "priority": zenoh.Priority.BACKGROUND}
-            self._session.get(_key(self._robot, "nobody"), handler, **options)
-
-    def _take_return(self) -> None:
-        """Note that the router has closed the query; in Zenoh's thread."""
-        self._back.set()
-        self._sign.set()
+        if closed.is_set():
+            self._pass(self.passed + len(self._under_way))
 
     def _take_acknowledgement(self, sample: zenoh.Sample) -> None:
         """Note what the node expects next; in Zenoh's thread."""

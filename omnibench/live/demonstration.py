@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Iterable, Sized
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.delivery import WINDOW, DeliveryError
 from omnibench.live.drive import (
-    ConcatenatedDrive,
     Recording,
     concatenate_recording,
     concatenated_truth,
@@ -32,7 +31,7 @@ from omnibench.live.topics import GraphNode
 from omnibench.live.wheels import joints_of
 from omnibench.live.wire import Odometry
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.calibration import Calibration, read_calibration
+from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, interpolated, moved_to
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
@@ -121,21 +120,16 @@ def demonstrate(
         if config.zenoh.users_file is None or config.zenoh.user is not None:
             session = open_session(client_session(config.zenoh), "replay")
             closing.callback(close_session, session)
-        for topic, rows in received.items():
+        for topic, messages in received.items():
 
-            def take(message: Odometry, rows: _Received = rows) -> None:
-                rows.append((message.stamp, message.pose))
+            def take(message: Odometry, messages: _Received = messages) -> None:
+                messages.append((message.stamp, message.pose))
 
             at: dict[str, Any] = {"session": session, "profile": config.profile, "domain": config.domain}
             closing.enter_context(subscribe(robot.name, topic=topic, callback=take, lossless=True, **at))
-        player = Player(
-            GraphNode(session, node.keys, "replay"),
-            robot.name,
-            drive,
-            config.replay,
-            names=joints_of(tracker.calibration.robot, robot.wheels).names,
-            noise=tracker.calibration.noise,
-        )
+        calibration = tracker.calibration
+        names, noise = joints_of(calibration.robot, robot.wheels).names, calibration.noise
+        player = Player(GraphNode(session, node.keys, "replay"), robot.name, drive, config.replay, names, noise)
 
         def with_health(event: Progress) -> None:
             health = node.health(robot.name)
@@ -154,18 +148,7 @@ def demonstrate(
                 f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the "
                 "recording; end the other one, or listen at another port"
             )
-    return _evaluate(drive, recording, tracker.calibration, report, received, health)
-
-
-def _evaluate(
-    drive: ConcatenatedDrive,
-    recording: Recording,
-    calibration: Calibration,
-    report: PlayReport,
-    received: Mapping[str, _Received],
-    health: Health,
-) -> Demonstration:
-    """Compare the node's output with the batch odometry, and all odometry with the truth or the reference."""
+    # Compare the node's output with the batch odometry, and all odometry with the truth or the reference.
     drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
     times = drive.wheel_times
     batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
@@ -187,10 +170,8 @@ def _evaluate(
     if recording.truth is not None:
         against, reference, chosen = "the simulated truth", concatenated_truth(drive, recording), rows
     else:
-        against, reference = (
-            "the reference poses of the recording",
-            interpolated(times, drive.slam_times, drive.slam_poses),
-        )
+        against = "the reference poses of the recording"
+        reference = interpolated(times, drive.slam_times, drive.slam_poses)
         chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
     fused = None
     if _FUSED in received:

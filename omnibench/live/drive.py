@@ -97,28 +97,16 @@ class ConcatenatedDrive:
     start_times: Array
     steering: Array | None = None
 
-    @property
-    def duration(self) -> float:
-        """Time from the first sample to the last, s."""
-        return float(max(self.wheel_times[-1], self.slam_times[-1]))
-
     def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
         """The drive's wheel samples for the batch odometry, with poses at ``stamps`` (s; default: every sample).
 
         session: name of the session, which starts with the drive.
         """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
-        return WheelLog(
-            self.wheel_times[1:],
-            self.rates[1:],
-            self.start_poses[0],
-            wanted,
-            self.angles[1:],
-            0.0,
-            session or "",
-            None if self.steering is None else self.steering[1:],
-            None if self.steering is None else self.robot.drive,
-        )
+        steering = None if self.steering is None else self.steering[1:]
+        drive = None if steering is None else self.robot.drive
+        times, rates, angles, start = self.wheel_times[1:], self.rates[1:], self.angles[1:], self.start_poses[0]
+        return WheelLog(times, rates, start, wanted, angles, 0.0, session or "", steering, drive)
 
 
 def concatenate_runs(
@@ -258,20 +246,14 @@ def _trimmed(run: Trajectory) -> Trajectory:
     if run.times[-1] <= end + _SAME_TIME:
         return run
     last = int(np.searchsorted(run.times, end - _SAME_TIME))  # the sample that reaches the end or passes it
-    times = np.append(run.times[:last], min(run.times[last], end))
-    kept = slice(0, last + 1)
-    angles = None
-    if run.angles is not None:
-        angles = run.angles[kept].copy()
-        angles[last] -= run.rates[last] * (run.times[last] - times[last])
-    targets, steering = (None if array is None else array[kept] for array in (run.targets, run.steering))
-    rows: dict[str, Any] = {
-        "times": times,
-        "rates": run.rates[kept],
-        "angles": angles,
-        "targets": targets,
-        "steering": steering,
-    }
+    rows: dict[str, Any] = {}
+    for name in ("times", "rates", "angles", "targets", "steering"):
+        array = getattr(run, name)
+        rows[name] = None if array is None else array[: last + 1].copy()
+    excess = max(run.times[last] - end, 0.0)
+    rows["times"][last] -= excess
+    if rows["angles"] is not None:
+        rows["angles"][last] -= run.rates[last] * excess
     return replace(run, **rows, odometry=None)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ipaddress
 import logging
-import os
 import re
 import secrets
 from collections.abc import Sequence
@@ -118,11 +117,8 @@ def make_keys(
         raise ConfigError(f"{existing[0]}: is there already; choose other names, or --force to replace all in {folder}")
     for path, content in contents.items():
         with replacing(path) as partial:
-            descriptor = os.open(
-                partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644 if path.suffix == ".pem" else 0o600
-            )
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(content)
+            partial.touch(0o644 if path.suffix == ".pem" else 0o600)
+            partial.write_bytes(content)
     return list(contents)
 
 
@@ -166,10 +162,11 @@ def _general_name(host: str) -> x509.GeneralName:
     return x509.DNSName(host)
 
 
-def check_files(ca: Path, certificate_file: Path, key_file: Path, *, listening: bool = False) -> None:
-    """ConfigError in one line: a file is missing, unreadable or expired, or the key is not the certificate's.
+def check_files(ca: Path, certificate_file: Path, key_file: Path, *, listening: bool = False) -> str | None:
+    """Check a certificate, and return the common name in it, which access rules use.
 
-    listening: the certificate must be a server's, or all that connect would refuse us.
+    listening: the certificate must be a server's, or all that connect would refuse us. ConfigError in one line: a file
+    is missing, unreadable or expired, or the key is not the certificate's.
     """
     authorities, certificates = _certificates(ca), _certificates(certificate_file)
     certificate = certificates[0]
@@ -189,14 +186,9 @@ def check_files(ca: Path, certificate_file: Path, key_file: Path, *, listening: 
         try:
             certificate.verify_directly_issued_by(authorities[0])
         except (ValueError, TypeError, InvalidSignature):
-            LOG.warning(
-                "tls: %s was not issued by %s; peers that trust only that authority refuse us", certificate_file, ca
-            )
-
-
-def common_name(path: Path) -> str | None:
-    """The common name in a certificate, used in access rules, or None. ConfigError as ``read_certificate``."""
-    names = read_certificate(path).subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+            said = "tls: %s was not issued by %s; peers that trust only that authority refuse us"
+            LOG.warning(said, certificate_file, ca)
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else None
 
 
@@ -211,16 +203,14 @@ def _certificates(path: Path) -> list[x509.Certificate]:
         certificates = x509.load_pem_x509_certificates(_content(path))
     except ValueError:
         raise ConfigError(f"tls: {path} holds no certificate in PEM; omnibench keys DIR makes some") from None
-    now, certificate = datetime.now(UTC), certificates[0]
-    if now < certificate.not_valid_before_utc:
-        raise ConfigError(
-            f"tls: {path} is valid from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on only, and it is "
-            f"{now:%Y-%m-%d %H:%M}; set the clock, or make a new one"
-        )
-    if now > certificate.not_valid_after_utc:
-        raise ConfigError(f"tls: {path} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a new one")
-    if now > certificate.not_valid_after_utc - _SOON:
-        LOG.warning("tls: %s expires on %s", path, f"{certificate.not_valid_after_utc:%Y-%m-%d}")
+    now, begin, end = datetime.now(UTC), certificates[0].not_valid_before_utc, certificates[0].not_valid_after_utc
+    if now < begin:
+        validity = f"{path} is valid from {begin:%Y-%m-%d %H:%M} UTC on only, and it is {now:%Y-%m-%d %H:%M}"
+        raise ConfigError(f"tls: {validity}; set the clock, or make a new one")
+    if now > end:
+        raise ConfigError(f"tls: {path} expired on {end:%Y-%m-%d}; make a new one")
+    if now > end - _SOON:
+        LOG.warning("tls: %s expires on %s", path, f"{end:%Y-%m-%d}")
     return certificates
 
 

@@ -10,7 +10,6 @@ allowed to subscribe to or to query.
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import logging
 import math
@@ -31,7 +30,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, field_va
 from omnibench.config import Model, RelativePath
 from omnibench.errors import ConfigError, DataError, nearest
 from omnibench.files import read_text
-from omnibench.live.keys import check_files, common_name, read_certificate
+from omnibench.live.keys import check_files, read_certificate
 from omnibench.live.stopping import Stop, wait_until
 from omnibench.live.topics import INPUTS, TOPICS, topic_name
 
@@ -39,11 +38,13 @@ LOG = logging.getLogger("omnibench.live")
 
 PORT: Final = 7447  # Zenoh's default
 _PROTOCOLS: Final = ("tcp", "tls", "quic", "udp", "ws")
-_ENCRYPTED: Final = ("tls", "quic")
+_ENCRYPTED: Final = ("tls/", "quic/")
+_UNIX: Final = "unixsock-stream/"  # begins the endpoint of a file
+_LOOPBACK = re.compile(r"localhost|127(\.\d+){3}|::1")
 _NETWORK = re.compile(
     rf"(?P<protocol>{'|'.join(_PROTOCOLS)})/(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s/:\[\]#?]+):(?P<port>\d{{1,5}})([?#]\S*)?"
 )
-_FILE = re.compile(r"unixsock-stream/[^\s#?]+")
+_FILE = re.compile(_UNIX + r"[^\s#?]+")
 
 
 def _checked_endpoint(text: str) -> str:
@@ -63,10 +64,10 @@ Names = Annotated[tuple[str, ...], _OneOrMore]
 Endpoints = Annotated[tuple[Annotated[str, AfterValidator(_checked_endpoint)], ...], _OneOrMore]
 
 
-def _address(endpoint: str) -> tuple[str, str, int] | None:
-    """Protocol, host and port of an endpoint; None if it is a Unix socket's file."""
+def _address(endpoint: str) -> tuple[str, str, int]:
+    """Protocol, host and port of an endpoint, which are empty if it is a Unix socket's file."""
     match = _NETWORK.fullmatch(endpoint)
-    return None if match is None else (match["protocol"], match["host"].strip("[]"), int(match["port"]))
+    return ("", "", 0) if match is None else (match["protocol"], match["host"].strip("[]"), int(match["port"]))
 
 
 class User(Model):
@@ -189,13 +190,9 @@ class SessionConfig(Model):
         if self.tls and self.listening and self.tls.certificate is None:
             raise ValueError("tls: a session that listens needs a certificate and its key")
         for endpoint in (*(self.listen or ()), *self.connect):
-            address = _address(endpoint)
-            if address is None:
-                continue
-            encrypted = address[0] in _ENCRYPTED
-            if encrypted and not self.tls:
+            if endpoint.startswith(_ENCRYPTED) and not self.tls:
                 raise ValueError(f"{endpoint}: give tls: {{ca: ..., certificate: ..., key: ...}}")
-            if self.tls and not encrypted:
+            if self.tls and not endpoint.startswith((*_ENCRYPTED, _UNIX)):
                 raise ValueError(f"{endpoint}: is not encrypted although tls is given; write tls/...")
         return self
 
@@ -218,18 +215,8 @@ class SessionConfig(Model):
         """The endpoints to which anybody on the network may connect without a password or a certificate."""
         if self.users_file or (self.tls and self.tls.mutual):
             return ()
-        return tuple(endpoint for endpoint in self.listening if not _is_loopback(endpoint))
-
-
-def _is_loopback(endpoint: str) -> bool:
-    """True if an endpoint can be reached from this machine only."""
-    address = _address(endpoint)
-    if address is None or address[1] == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(address[1]).is_loopback
-    except ValueError:
-        return False
+        on_network = [endpoint for endpoint in self.listening if not endpoint.startswith(_UNIX)]
+        return tuple(endpoint for endpoint in on_network if not _LOOPBACK.fullmatch(_address(endpoint)[1]))
 
 
 Right = Literal["write", "read", "ask", "put", "subscribe", "serve"]
@@ -333,21 +320,17 @@ def _access_control(access: Access, *, by_certificate: bool, own_name: str | Non
 
 
 _MOST_BYTES: Final = 1 << 20  # of files of users and passwords; chosen
-_PRIORITIES: Final = (
-    *("control", "real_time", "interactive_high", "interactive_low"),
-    *("data_high", "data", "data_low", "background"),
-)
+_QUEUES: Final = "transport/link/tx/queue/size"
 _SETTINGS: Final[dict[str, Any]] = {
     "timestamping/enabled": True,  # advanced publishers need it
     # A client reconnects within 0.5 s after its router has returned; with Zenoh's defaults it takes 1 s to 4 s.
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-    # Room for bursts: with Zenoh's default of 2 batches a healthy subscriber loses samples at 1 kHz. A message to a
-    # subscriber that does not read is dropped soon, so that it delays no other.
-    "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
+    # A message to a subscriber that does not read is dropped soon, so that it delays no other.
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,  # us
     # 100 connections that say nothing keep others from logging in until they are given up, with Zenoh's default 10 s.
     "transport/unicast/accept_timeout": 3000,  # ms
 }
+_BATCHES: Final = 16  # of each priority; chosen
 _SCOUTING_DELAY: Final = 500  # ms; Zenoh's default
 _CONNECT_TIMEOUT: Final = 3.0  # s for a router or peer to reach an endpoint it connects to; chosen
 _GRACE: Final = 0.5  # s after a signal for a session that is about to be open; chosen
@@ -391,14 +374,16 @@ def zenoh_config(config: SessionConfig) -> zenoh.Config:
         if tls.certificate is None or tls.key is None:
             read_certificate(tls.ca)
         else:
-            check_files(tls.ca, tls.certificate, tls.key, listening=bool(config.listening))
+            name = check_files(tls.ca, tls.certificate, tls.key, listening=bool(config.listening))
+            own_name = name if tls.mutual else own_name
             for side in ("listen", "connect"):
                 certificates |= {f"{side}_certificate": str(tls.certificate), f"{side}_private_key": str(tls.key)}
-            own_name = common_name(tls.certificate) if tls.mutual else own_name
     if config.access is not None:
         by_certificate = tls is not None and tls.mutual
         given["access_control"] = _access_control(config.access, by_certificate=by_certificate, own_name=own_name)
     settings = zenoh.Config()
+    # Room for bursts: with Zenoh's default of 2 batches a healthy subscriber loses samples at 1 kHz.
+    given[_QUEUES] = dict.fromkeys(json.loads(settings.get_json(_QUEUES)), _BATCHES)
     for key, value in given.items():
         settings.insert_json5(key, json.dumps(value))
     for key, value in config.extra.items():
@@ -451,32 +436,25 @@ def open_session(config: SessionConfig, purpose: str, stop: Stop | None = None) 
     """
     zenoh.try_init_log_from_env()
     try:
-        settings = zenoh_config(config)
-        try:
-            session = _opened(settings, stop)
-        except zenoh.ZError as error:
-            raise ConfigError(_why_not_open(config, _SOURCE.sub("", str(error)).strip())) from None
-        try:
-            # Zenoh opens a router or peer even if it is refused, and retries for ever.
-            patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
-            if config.connecting and not wait_until(lambda: is_connected(session), patience):
-                raise ConfigError(_why_not_connected(config))
-        except BaseException:
-            close_session(session)
-            raise
+        session = _opened(zenoh_config(config), stop)
     except ConfigError as error:
         raise ConfigError(f"{purpose}: {error}") from None
-    if config.unprotected:
-        LOG.warning(
-            "%s listens at %s, where anybody on the network may connect; give users_file, or tls and access",
-            purpose,
-            ", ".join(config.unprotected),
-        )
-    elif config.listening and config.access is None and (config.tls or config.users_file):
-        who, way = f"with a password of {config.users_file}", "give access"
-        if config.tls and not config.users_file:
-            who = f"with a certificate of {config.tls.ca}"
-            if not config.tls.mutual:
+    except zenoh.ZError as error:
+        raise ConfigError(f"{purpose}: {_why_not_open(config, _SOURCE.sub('', str(error)).strip())}") from None
+    # Zenoh opens a router or peer even if it is refused, and retries for ever.
+    patience = 0.0 if config.mode == "client" else max(_CONNECT_TIMEOUT, config.wait)
+    if config.connecting and not wait_until(lambda: is_connected(session), patience):
+        close_session(session)
+        raise ConfigError(f"{purpose}: {_why_not_connected(config)}")
+    exposed, tls, users = ", ".join(config.unprotected), config.tls, config.users_file
+    if exposed:
+        way = "where anybody on the network may connect; give users_file, or tls and access"
+        LOG.warning("%s listens at %s, %s", purpose, exposed, way)
+    elif config.listening and config.access is None and (tls or users):
+        who, way = f"with a password of {users}", "give access"
+        if tls and not users:
+            who = f"with a certificate of {tls.ca}"
+            if not tls.mutual:
                 who, way = "who reaches it", "give tls mutual: true, and access"
         said = "%s has no access rules, so that everybody %s may do everything, as swap calibrations; %s"
         LOG.warning(said, purpose, who, way)
@@ -550,52 +528,46 @@ def _why_not_connected(config: SessionConfig) -> str:
 
 
 def _why(endpoint: str, config: SessionConfig) -> str:
-    protocol, host, port = _address(endpoint) or ("", "", 0)
+    """The reason why an endpoint was not reached, or that it refuses us, after a connection like Zenoh's."""
+    protocol, host, port = _address(endpoint)
     if protocol not in ("tcp", "tls", "ws"):
         return f"no answer, or it refuses us; {_ELSEWHERE}"
+    connected, tls, asks_for_tls = False, config.tls, "asks for TLS; connect to tls/... and give tls"
     try:
-        connection = socket.create_connection((host, port), _TIMEOUT)
-    except socket.gaierror:
-        return f"there is no host called {host}"
-    except ConnectionRefusedError:
-        return f"nothing listens there; {_ELSEWHERE}"
-    except TimeoutError:
-        return f"no answer within {_TIMEOUT:.0f} s; check the address, the network and its firewalls"
+        with socket.create_connection((host, port), _TIMEOUT) as connection:
+            connected = True
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+            context.check_hostname = tls is not None and tls.verify_name
+            if tls is None:
+                context.verify_mode = ssl.CERT_NONE
+            else:
+                context.load_verify_locations(tls.ca)
+                if tls.certificate is not None and tls.mutual:
+                    context.load_cert_chain(tls.certificate, tls.key)
+            if protocol != "ws":
+                with context.wrap_socket(connection, server_hostname=host) as encrypted:
+                    if tls is None:
+                        return asks_for_tls
+                    encrypted.recv(1)  # with TLS 1.3 a refusal comes after the handshake
+    except ssl.SSLCertVerificationError as error:
+        return f"we refuse its certificate: {error.verify_message.rstrip('.')}; check tls: ca ({tls and tls.ca})"
     except OSError as error:
-        return f"cannot be reached: {error.strerror or error}"
-    refused = (
+        reason = getattr(error, "reason", None) or error.strerror or str(error)
+        if not connected:
+            reasons: dict[type[OSError], str] = {
+                socket.gaierror: f"there is no host called {host}",
+                ConnectionRefusedError: f"nothing listens there; {_ELSEWHERE}",
+                TimeoutError: f"no answer within {_TIMEOUT:.0f} s; check the address, the network and its firewalls",
+            }
+            return reasons.get(type(error), f"cannot be reached: {reason}")
+        if tls is None and "ALERT" in reason:
+            return asks_for_tls
+        if tls is not None and not isinstance(error, TimeoutError):
+            explanation = next((text for sign, text in _ALERTS.items() if reason.endswith(sign)), None)
+            return explanation or f"the TLS handshake fails: {reason.replace('_', ' ').lower()}"
+    if config.user is not None:
+        return f"refuses user {config.user.name!r}: wrong name or password; compare with the router's users_file"
+    return (
         "refuses us, or does not answer: it may ask for a user and password (user: name, password_file), it stands "
         "still, or it is not a Zenoh router"
     )
-    if config.user is not None:
-        name = config.user.name
-        refused = f"refuses user {name!r}: wrong name or password; compare with the router's users_file"
-    with connection:
-        return refused if protocol == "ws" else _why_not_tls(connection, host, config.tls) or refused
-
-
-def _why_not_tls(connection: socket.socket, host: str, tls: Tls | None) -> str | None:
-    """Why a TLS handshake as Zenoh's fails, or, without TLS, that the other side asks for it; None if neither."""
-    asks = "asks for TLS; connect to tls/... and give tls"
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if tls is None else ssl.create_default_context(cafile=str(tls.ca))
-    context.check_hostname = tls is not None and tls.verify_name
-    try:
-        if tls is None:
-            context.verify_mode = ssl.CERT_NONE
-        elif tls.certificate is not None and tls.mutual:
-            context.load_cert_chain(tls.certificate, tls.key)
-        with context.wrap_socket(connection, server_hostname=host) as encrypted:
-            if tls is None:
-                return asks
-            encrypted.recv(1)  # with TLS 1.3 a refusal comes after the handshake
-    except ssl.SSLCertVerificationError as error:
-        return f"we refuse its certificate: {error.verify_message.rstrip('.')}; check tls: ca ({tls and tls.ca})"
-    except TimeoutError:
-        return None
-    except OSError as error:
-        reason = getattr(error, "reason", None) or error.strerror or str(error)
-        if tls is None:
-            return asks if "ALERT" in reason else None
-        explanation = next((text for sign, text in _ALERTS.items() if reason.endswith(sign)), None)
-        return explanation or f"the TLS handshake fails: {reason.replace('_', ' ').lower()}"
-    return None

@@ -202,7 +202,15 @@ class Player:
         patience = max(self._config.wait, _LEAST_PATIENCE)
         with Delivery(self._session, self._robot, stop, patience) as delivery:
             try:
-                self._wait_for_subscriber(stop)
+                # Wait until the wheel samples have a subscriber, and then for a moment for one of the SLAM poses.
+                wheels, slam = self._publishers.values()
+                wait = self._config.wait
+                if wait and not wait_until(lambda: wheels.matched, wait, stop) and not stop.is_set():
+                    raise ConfigError(
+                        f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
+                        f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
+                    )
+                wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
                 # To the robot's node, if there is one, or else to whoever subscribes.
                 delivery.acknowledged = self._robot in alive_robots(self._session, patience, stop)
                 before = self._anomalies(delivery, stop)
@@ -239,7 +247,8 @@ class Player:
         wall, interrupted = time.perf_counter() - begin, interrupted or stop.is_set()
         watch(self._progress(sum(sent.values()), arrival))
         late = 0.0 if math.isinf(self._config.speed) else late
-        return PlayReport(sent, total, delivery.taken, delivery.restarts, arrival, wall, late, interrupted, anomalies)
+        taken = delivery.passed if delivery.acknowledged else None
+        return PlayReport(sent, total, taken, delivery.restarts, arrival, wall, late, interrupted, anomalies)
 
     def _anomalies(self, delivery: Delivery, stop: threading.Event) -> Counter[str]:
         """The counters of the robot's node above 0 of what should not happen; none if there is none, or no answer."""
@@ -254,14 +263,3 @@ class Player:
         """Messages sent, and how many ``seconds`` of the recording they are."""
         note = f"{seconds:.0f} s of the drive"
         return Progress(f"playing as {self._robot}", sent, len(self._messages), "message", note=note)
-
-    def _wait_for_subscriber(self, stop: threading.Event) -> None:
-        """Wait until the wheel samples have a subscriber, and then up to _SLAM_WAIT s for one of the SLAM poses."""
-        wheels, slam = (self._publishers[topic] for topic in INPUTS)
-        wait = self._config.wait
-        if wait and not wait_until(lambda: wheels.matched, wait, stop) and not stop.is_set():
-            raise ConfigError(
-                f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
-                f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
-            )
-        wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
