@@ -82,7 +82,6 @@ class Delivery(Closing):
             self._look(WINDOW) >= WINDOW or self._gap or (self.acknowledged and self._silence() >= _FIRST_RETRY)
         ):
             self._wait(self._sign)
-            self._sign.clear()
         waited = time.monotonic() - began
         self.paused += waited if waited > _FIRST_RETRY else 0.0
         if self._stop.is_set():
@@ -100,7 +99,6 @@ class Delivery(Closing):
         """Wait until all has arrived, or a short time if ``stop`` is set. DeliveryError: the receiver is given up."""
         while self._look(1) and not self._stop.is_set():
             self._wait(self._sign)
-            self._sign.clear()
         # After a stop what is under way may still arrive.
         wait_until(lambda: not (self._under_way and self.acknowledged), _FIRST_RETRY)
 
@@ -116,6 +114,7 @@ class Delivery(Closing):
         """Wait for a sign of the receiver for a moment. DeliveryError: there was none for too long."""
         began = time.monotonic()
         sign.wait(_POLL_PERIOD)
+        self._sign.clear()
         self._waited += min(time.monotonic() - began, _LONGEST_POLL)
         if self._waited > self._patience:
             who, rights = "its node" if self.acknowledged else "the router", ""

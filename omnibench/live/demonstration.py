@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 
 from omnibench.live.config import LiveConfig, client_session, robot_called
 from omnibench.live.delivery import WINDOW, DeliveryError
-from omnibench.live.drive import (
-    Recording,
-    concatenate_recording,
-    concatenated_truth,
-)
+from omnibench.live.drive import Recording, concatenate_recording, concatenated_truth
 from omnibench.live.health import Counts, Health
 from omnibench.live.network import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
@@ -107,9 +103,8 @@ def demonstrate(
     """
     robot = robot_called(config, config.replay.robot)
     load_effects(config)
-    read_calibration(robot.calibration).check_wheels(
-        recording.dataset.robot, f"the recording {recording.dataset.name} for robot {robot.name!r}"
-    )
+    what = f"the recording {recording.dataset.name} for robot {robot.name!r}"
+    read_calibration(robot.calibration).check_wheels(recording.dataset.robot, what)
     drive = concatenate_recording(recording, pause=config.replay.pause, split=config.replay.split)
     received: dict[str, _Received] = {"odom": []}
     if config.fusion_of(robot) is not None:
@@ -144,10 +139,8 @@ def demonstrate(
         health = node.health(robot.name)
         # Samples that the replay did not send are another sender's.
         if health.counts["samples"] > report.sent["joint_states"] or len(tracker.flows) > 1:
-            raise DeliveryError(
-                f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the "
-                "recording; end the other one, or listen at another port"
-            )
+            why = f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the recording"
+            raise DeliveryError(f"{why}; end the other one, or listen at another port")
     # Compare the node's output with the batch odometry, and all odometry with the truth or the reference.
     drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
     times = drive.wheel_times

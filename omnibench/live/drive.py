@@ -128,9 +128,8 @@ def concatenate_runs(
     if start_poses is not None:
         starts = np.array(start_poses, dtype=float)
         if starts.shape != moves.shape or not np.isfinite(starts).all():
-            raise DataError(
-                f"data set {dataset.name}: start poses have shape {starts.shape}, expected {moves.shape}, finite"
-            )
+            shapes = f"have shape {starts.shape}, expected {moves.shape}, finite"
+            raise DataError(f"data set {dataset.name}: start poses {shapes}")
         # Multiples of 2 pi are added so that headings are continuous from run to run.
         errors = starts[:, 2] - np.append(0.0, np.cumsum(moves[:-1, 2]))
         starts[:, 2] += np.unwrap(errors) - errors
@@ -141,10 +140,8 @@ def concatenate_runs(
     missing = [np.ceil((run.pose_times[-1] - run.times[-1] - _SAME_TIME) / period) for run in runs[:-1]]
     resting = [*(max(0, int(samples)) + round(pause / period) for samples in missing), 0]
     if sum(resting) > _MOST_RESTING:
-        raise ConfigError(
-            f"pause: with {pause:g} s the robot stands still for {sum(resting)} samples, more than {_MOST_RESTING}; "
-            "give a shorter one, and check the times of the last poses"
-        )
+        standstill = f"with {pause:g} s the robot stands still for {sum(resting)} samples, more than {_MOST_RESTING}"
+        raise ConfigError(f"pause: {standstill}; give a shorter one, and check the times of the last poses")
     # Rows of the drive's arrays, run by run; those of the wheels begin with the baseline.
     begins, times, rates = [0.0], [np.zeros(1)], [np.zeros((1, len(dataset.robot.wheel_names)))]
     angles, steering, slam_times, slam_poses, covariances = (list[Array]() for _ in range(5))
@@ -228,10 +225,7 @@ def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
         if not run.has_poses:
             reason = "a single reference pose; it cannot be concatenated"
             if run.references is not None:
-                reason = (
-                    "distances, turns and the like and no reference poses, so that nothing says where the next run "
-                    "begins; replay runs with poses, or others of --split"
-                )
+                reason = "distances, turns and the like, and no poses; replay runs with poses, or others of --split"
             raise DataError(f"data set {dataset.name}: run {run.id} has {reason}")
         sessions.setdefault(run.session, []).append(run)
     for runs in sessions.values():
@@ -265,9 +259,8 @@ def _composed(first: Array, moves: Array) -> Array:
 def _true_poses(recording: Recording, run: Trajectory, stamps: Array) -> Array:
     """True poses (K, 3) of a simulated robot at stamps (K,), s since a run's start. DataError without a truth."""
     if recording.truth is None:
-        raise DataError(
-            f"data set {recording.dataset.name}: it has no truth; name a comparison's config, which simulates it"
-        )
+        name = recording.dataset.name
+        raise DataError(f"data set {name}: it has no truth; name a comparison's config, which simulates it")
     if run.id in recording.paths:
         return moved_to(run.start, recording.paths[run.id].at(np.append(0.0, stamps)))[1:]
     if run.targets is None or run.angles is None:
@@ -337,9 +330,6 @@ class ReplayConfig(Model):
     wheels: WheelChannel = WheelChannel()
     slam: SlamChannel = SlamChannel()
     stamp_origin: int | None = Field(
-        None,
-        gt=0,
-        le=_LATEST_ORIGIN,
-        description="stamp of the recording's start, ns; default: the replay's start",
+        None, gt=0, le=_LATEST_ORIGIN, description="stamp of the recording's start, ns; default: the replay's start"
     )
     wait: NonNegative = Field(10.0, description="longest wait for a subscriber of the wheel samples, s; 0: do not wait")

@@ -80,9 +80,7 @@ def make_keys(
     # The router's certificate: the named one, or that of ``node`` if there is one.
     chosen = router or _ROUTER
     if chosen not in names and (router is not None or hosts):
-        raise ConfigError(
-            f"{chosen!r}, whose certificate would be the router's, is not among {', '.join(names)}; say --router NAME"
-        )
+        raise ConfigError(f"the router's name, {chosen!r}, is not among {', '.join(names)}; say --router NAME")
     served = [_general_name(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
     until = datetime.now(UTC) + timedelta(days=days)
     made: dict[str, _Pair] = {}
@@ -177,10 +175,8 @@ def check_files(ca: Path, certificate_file: Path, key_file: Path, *, listening: 
     except (x509.ExtensionNotFound, ValueError):  # RFC 5280, section 4.2.1.12: it is for any purpose
         purposes = [ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE]
     if listening and not {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE} & set(purposes):
-        raise ConfigError(
-            f"tls: {certificate_file} is a client's, and all that connect would refuse us; listen with the router's, "
-            "which omnibench keys DIR NAME --router NAME makes"
-        )
+        way = "listen with the router's, which omnibench keys DIR NAME --router NAME makes"
+        raise ConfigError(f"tls: {certificate_file} is a client's, and all that connect would refuse us; {way}")
     # A certificate that the authority did not issue is a warning; chains of several certificates are not checked.
     if len(authorities) == len(certificates) == 1:
         try:

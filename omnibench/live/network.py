@@ -50,10 +50,8 @@ _FILE = re.compile(_UNIX + r"[^\s#?]+")
 def _checked_endpoint(text: str) -> str:
     match = _NETWORK.fullmatch(text)
     if not _FILE.fullmatch(text) and (match is None or int(match["port"]) > 65535):
-        raise ValueError(
-            f"{text!r} is not an endpoint; write protocol/host:port as tcp/127.0.0.1:{PORT} (protocols: "
-            f"{', '.join(_PROTOCOLS)})"
-        )
+        known = ", ".join(_PROTOCOLS)
+        raise ValueError(f"{text!r} is not an endpoint; write tcp/127.0.0.1:{PORT} (protocols: {known})")
     return text
 
 
@@ -75,9 +73,7 @@ class User(Model):
 
     name: str = Field(min_length=1)
     password: SecretStr | None = Field(None, description="in plain text; a file or an environment variable is safer")
-    password_file: RelativePath | None = Field(
-        None, description="its first line is the password; relative to the config file"
-    )
+    password_file: RelativePath | None = Field(None, description="a file whose first line is the password")
     password_env: str | None = Field(None, description="environment variable that holds the password")
 
     @model_validator(mode="after")
@@ -108,13 +104,14 @@ class Tls(Model):
 
 
 class AccessRule(Model):
-    """Rights of some peers. Keys are key expressions; ``**`` does not match ``@ros2_lv``, which must be named."""
+    """Rights of some peers. Keys are key expressions; ``**`` does not match ``@ros2_lv``, which must be named.
+
+    Tokens are Zenoh's liveliness tokens, which tell who is there.
+    """
 
     who: Names = Field(min_length=1, description="common names of certificates or, without certificates, user names")
-    write: Names = Field(
-        (), description="keys to put and delete, to answer queries on and to declare liveliness tokens"
-    )
-    read: Names = Field((), description="keys to subscribe to, to query and to look for liveliness tokens")
+    write: Names = Field((), description="keys to put and delete, to answer queries on and to declare tokens of")
+    read: Names = Field((), description="keys to subscribe to, to query and to look for tokens of")
 
     @model_validator(mode="after")
     def _grants_something(self) -> Self:
@@ -130,12 +127,9 @@ class Access(Model):
     """
 
     robots: dict[Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], str] = Field(
-        {},
-        description="robot: its peer's name. May write its joint_states and slam_pose and read all its topics",
+        {}, description="robot: its peer's name. May write its joint_states and slam_pose and read all its topics"
     )
-    nodes: tuple[str, ...] = Field(
-        (), description="omnibench nodes elsewhere: may read robots' inputs and write all outputs"
-    )
+    nodes: tuple[str, ...] = Field((), description="nodes elsewhere: may read robots' inputs and write all outputs")
     viewers: tuple[str, ...] = Field((), description="may read all topics and query info, health and pose")
     operators: tuple[str, ...] = Field((), description="viewers that may also set poses, reset and swap calibrations")
     rules: tuple[AccessRule, ...] = Field((), description="more rights")
@@ -172,9 +166,7 @@ class SessionConfig(Model):
     users_file: RelativePath | None = Field(None, description="users that may connect to us: lines of user:password")
     tls: Tls | None = None
     access: Access | None = Field(None, description="access rights at this router; default: all may do everything")
-    largest_message: int = Field(
-        1_000_000, ge=1000, description="bytes; larger messages are dropped before anybody's rights are looked at"
-    )
+    largest_message: int = Field(1_000_000, ge=1000, description="bytes; larger ones are dropped, whoever sends them")
     extra: dict[str, Any] = Field({}, description="settings of Zenoh itself, as transport/link/tx/lease: 3000")
 
     @model_validator(mode="after")
@@ -567,7 +559,4 @@ def _why(endpoint: str, config: SessionConfig) -> str:
             return explanation or f"the TLS handshake fails: {reason.replace('_', ' ').lower()}"
     if config.user is not None:
         return f"refuses user {config.user.name!r}: wrong name or password; compare with the router's users_file"
-    return (
-        "refuses us, or does not answer: it may ask for a user and password (user: name, password_file), it stands "
-        "still, or it is not a Zenoh router"
-    )
+    return "refuses us, or does not answer: it may ask for a user and password (user), or it is not a Zenoh router"

@@ -206,10 +206,8 @@ class Player:
                 wheels, slam = self._publishers.values()
                 wait = self._config.wait
                 if wait and not wait_until(lambda: wheels.matched, wait, stop) and not stop.is_set():
-                    raise ConfigError(
-                        f"nobody subscribes to {wheels.key} after {wait:g} s; start omnibench live for robot "
-                        f"{self._robot}, check robot, profile and endpoint of both, or wait longer"
-                    )
+                    way = f"start omnibench live for robot {self._robot}, check robot, profile and endpoint of both"
+                    raise ConfigError(f"nobody subscribes to {wheels.key} after {wait:g} s; {way}, or wait longer")
                 wait_until(lambda: slam.matched, min(wait, _SLAM_WAIT), stop)
                 # To the robot's node, if there is one, or else to whoever subscribes.
                 delivery.acknowledged = self._robot in alive_robots(self._session, patience, stop)
