@@ -51,7 +51,7 @@ def _checked_endpoint(text: str) -> str:
     match = _NETWORK.fullmatch(text)
     if not _FILE.fullmatch(text) and (match is None or int(match["port"]) > 65535):
         known = ", ".join(_PROTOCOLS)
-        raise ValueError(f"{text!r} is not an endpoint; write tcp/127.0.0.1:{PORT} (protocols: {known})")
+        raise ValueError(f"{text!r} is not an endpoint; write protocol/host:port as tcp/127.0.0.1:{PORT} ({known})")
     return text
 
 
