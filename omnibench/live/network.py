@@ -288,25 +288,25 @@ def _access_control(access: Access, *, by_certificate: bool, own_name: str | Non
     rights = rights_of(access)
     if own_name is not None:
         rights[own_name] = dict.fromkeys(("write", "read"), sorted(_with_advanced(["**", _ROS_GRAPH])))
-    named = {key for granted in rights.values() for keys in granted.values() for key in keys if "@" in key}
-    rules: list[dict[str, Any]] = []
-
-    def add_rule(name: str, permission: str, flow: str, messages: Iterable[str], keys: list[str]) -> str:
-        what = {"flows": [flow], "messages": list(messages), "key_exprs": keys}
-        rules.append({"id": name, "permission": permission} | what)
-        return name
-
+    allowed = [(who, right, keys) for who, granted in rights.items() for right, keys in granted.items() if keys]
+    outgoing = {"**", "**" + _ADVANCED, *(key for _, _, keys in allowed for key in keys if "@" in key)}
     every_message = _MESSAGES["write"] + _MESSAGES["read"]
-    # Peers without a rule are a subject too, or Zenoh would not log that they are refused.
-    nothing = add_rule("nothing", "deny", "ingress", every_message, ["**"])
-    outgoing = add_rule("outgoing", "allow", "egress", every_message, sorted({"**", "**" + _ADVANCED, *named}))
+
+    def rule(name: str, permission: str, flow: str, messages: tuple[str, ...], keys: list[str]) -> dict[str, Any]:
+        return {"id": name, "permission": permission, "flows": [flow], "messages": messages, "key_exprs": keys}
+
+    rules = [
+        # Peers without a rule are a subject too, or Zenoh would not log that they are refused.
+        rule("nothing", "deny", "ingress", every_message, ["**"]),
+        rule("outgoing", "allow", "egress", every_message, sorted(outgoing)),
+        *(rule(f"{right} of {who}", "allow", "ingress", _MESSAGES[right], keys) for who, right, keys in allowed),
+    ]
     subjects: list[dict[str, Any]] = [{"id": "anyone"}]
-    policies = [{"id": "anyone", "subjects": ["anyone"], "rules": [nothing]}]
-    for number, (who, granted) in enumerate(rights.items()):
-        name, allowed = f"{number}", [(right, keys) for right, keys in granted.items() if keys]
-        names = [add_rule(f"{name} {right}", "allow", "ingress", _MESSAGES[right], keys) for right, keys in allowed]
-        subjects.append({"id": name, "cert_common_names" if by_certificate else "usernames": [who]})
-        policies.append({"id": name, "subjects": [name], "rules": [outgoing, *names]})
+    policies = [{"id": "anyone", "subjects": ["anyone"], "rules": ["nothing"]}]
+    for who in rights:
+        peer, names = f"peer {who}", [f"{right} of {who}" for name, right, _ in allowed if name == who]
+        subjects.append({"id": peer, "cert_common_names" if by_certificate else "usernames": [who]})
+        policies.append({"id": peer, "subjects": [peer], "rules": ["outgoing", *names]})
     lists = {"rules": rules, "subjects": subjects, "policies": policies}
     return {"enabled": True, "default_permission": "deny"} | lists
 
