@@ -256,8 +256,7 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
     """A client's session, and the keys of the profile."""
     from omnibench.config import validate
     from omnibench.live.config import ClientConfig, read_client_config
-    from omnibench.live.network import close_session, open_session
-    from omnibench.live.session_config import SessionConfig
+    from omnibench.live.network import SessionConfig, close_session, open_session
     from omnibench.live.topics import KeySpace
 
     chosen: ClientConfig = ClientConfig() if file is None else read_client_config(file)

@@ -12,7 +12,7 @@ from omnibench.config import Model, Positive, RelativePath, read_model, read_yam
 from omnibench.errors import ConfigError, UnknownNameError
 from omnibench.live.drive import ReplayConfig
 from omnibench.live.fusion import FusionSettings
-from omnibench.live.session_config import SessionConfig
+from omnibench.live.network import SessionConfig
 from omnibench.live.topics import Frames, Profile
 from omnibench.live.wheels import WheelSettings
 

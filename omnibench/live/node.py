@@ -26,13 +26,14 @@ from omnibench.environment import package_versions
 from omnibench.errors import one_line, require_type
 from omnibench.live.config import LiveConfig, RobotConfig, robot_called
 from omnibench.live.control import QueryServer
+from omnibench.live.delivery import AcknowledgedFlows
 from omnibench.live.health import Counts, Health, anomalies_in_words, diagnostic
 from omnibench.live.network import close_session, open_session
 from omnibench.live.presence import Claim
 from omnibench.live.record import PORT, FoxgloveServer, Recorder, free_path
 from omnibench.live.state import RobotMemory
 from omnibench.live.stopping import Closing, RateLimiter, Stop
-from omnibench.live.topics import OUTPUTS, TOPICS, AcknowledgedFlows, GraphNode, KeySpace, Update
+from omnibench.live.topics import OUTPUTS, TOPICS, GraphNode, KeySpace, Update
 from omnibench.live.tracker import RobotTracker
 from omnibench.live.wire import Diagnostics, Flow, MissedMessages, flow_of
 from omnibench.registry import load_plugins
@@ -217,7 +218,6 @@ class RobotService:
             self._take_turn()
         with self._working:  # a turn that is under way ends first
             self.tracker.close()
-            self._flows.close()
         self._token.undeclare()
 
     def _receive_poses(self) -> None:

@@ -14,9 +14,8 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, require_choice
-from omnibench.live.network import close_session, open_session
+from omnibench.live.network import SessionConfig, close_session, open_session
 from omnibench.live.presence import checked_robot
-from omnibench.live.session_config import SessionConfig
 from omnibench.live.stopping import Closing, RateLimiter
 from omnibench.live.topics import TOPICS, KeySpace, Profile
 from omnibench.live.wire import ODOMETRY, MessageError, MissedMessages, Odometry
