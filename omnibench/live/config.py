@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
 from omnibench.errors import ConfigError, UnknownNameError
@@ -65,14 +65,16 @@ class LiveConfig(Model):
     state: RelativePath | None = Field(None, description="folder in which pose and calibration outlive the node")
     record: RelativePath | None = Field(None, description="MCAP file to record to")
     foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
+    rerun: bool | RelativePath = Field(False, description="show in Rerun's viewer (true), or record for it (FILE.rrd)")
     replay: ReplaySource = ReplaySource()
 
-    @field_validator("record")
+    @field_validator("record", "rerun")
     @classmethod
-    def _is_mcap(cls, record: Path | None) -> Path | None:
-        if record is not None and record.suffix != ".mcap":
-            raise ValueError(f"{str(record)!r}: name a file that ends in .mcap")
-        return record
+    def _has_suffix(cls, file: Path | bool | None, info: ValidationInfo) -> Path | bool | None:
+        suffix = ".mcap" if info.field_name == "record" else ".rrd"
+        if isinstance(file, Path) and file.suffix != suffix:
+            raise ValueError(f"{str(file)!r}: name a file that ends in {suffix}")
+        return file
 
     @model_validator(mode="after")
     def _robots_differ(self) -> LiveConfig:

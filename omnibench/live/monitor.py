@@ -39,17 +39,6 @@ class OdometryStatus:
     undecodable: int
     missed: int = 0
 
-    @property
-    def position_sigma(self) -> float:
-        """Standard deviation of the position along an axis, m: the root of the mean of x's and y's variances."""
-        covariance = self.message.pose_covariance
-        return math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]) / 2, 0.0))
-
-    @property
-    def heading_sigma(self) -> float:
-        """Standard deviation of the heading, rad."""
-        return math.sqrt(max(float(self.message.pose_covariance[2, 2]), 0.0))
-
 
 @dataclass(frozen=True)
 class HealthSummary:
@@ -92,8 +81,8 @@ def _odometry_record(status: OdometryStatus | None) -> dict[str, Any] | None:
         "frame": message.frame,
         "pose": message.pose.tolist(),
         "pose_covariance": message.pose_covariance.tolist(),
-        "position_sigma_m": status.position_sigma,
-        "heading_sigma_rad": status.heading_sigma,
+        "position_sigma_m": message.position_sigma,
+        "heading_sigma_rad": message.heading_sigma,
         "twist": message.twist.tolist(),
         "rate_hz": status.rate,
         "age_s": status.age,

@@ -230,6 +230,16 @@ class Odometry:
         """The stamp in s."""
         return self.stamp / _SECOND
 
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation of the position along an axis, m: the root of the mean of x's and y's variances."""
+        return math.sqrt(max(float(self.pose_covariance[0, 0] + self.pose_covariance[1, 1]) / 2, 0.0))
+
+    @property
+    def heading_sigma(self) -> float:
+        """Standard deviation of the heading, rad."""
+        return math.sqrt(max(float(self.pose_covariance[2, 2]), 0.0))
+
     def to_ros(self) -> Any:
         vx, vy, w = self.twist.tolist()
         twist = _make("geometry_msgs/msg/Twist", _vector("Vector3", vx, vy, 0.0), _vector("Vector3", 0.0, 0.0, w))
