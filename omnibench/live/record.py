@@ -235,10 +235,12 @@ class Recorder:
         self.stop()
 
     def _run(self) -> None:
-        listener, file, flush_at = self._listener, self._file, 0.0
+        listener, file = self._listener, self._file
         assert listener is not None
         assert file is not None
         try:
+            file.mcap.flush()  # an empty file is valid too
+            flush_at = time.monotonic() + _FLUSH_PERIOD
             for arrival in listener:
                 if arrival is not None:
                     self._add(file, arrival)
