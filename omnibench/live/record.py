@@ -18,6 +18,7 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from omnibench.errors import DataError
+from omnibench.live.stopping import Closing
 from omnibench.live.topics import TOPICS, Arrival, KeySpace, TopicListener
 from omnibench.live.wire import MessageError, MessageType
 
@@ -29,7 +30,7 @@ _LONGEST_QUEUE: Final = 200_000  # messages, about 150 MB, that wait while the d
 _log = logging.getLogger(__name__)
 
 
-class QueuedListener:
+class QueuedListener(Closing):
     """A topic listener whose messages wait for a thread that iterates over them; None after each batch.
 
     The iteration ends after ``close``, with what has arrived until then. lost: messages dropped because the queue was
@@ -150,8 +151,8 @@ class _McapFile:
         self.size = self._file.tell()
 
 
-class Recorder:
-    """Records the robots' topics from ``start`` to ``stop`` (or as a context manager); payloads are not changed.
+class Recorder(Closing):
+    """Records the robots' topics from its construction to ``close``; payloads are not changed.
 
     Log times are times of arrival, publish times the stamps in the messages' headers. If writing fails, only the
     recording ends: ``failure`` and ``on_failure`` (by default the log) get one line, and what was recorded stays
@@ -178,11 +179,15 @@ class Recorder:
         self.undecodable: Counter[str] = Counter()
         self.failure: str | None = None
         self._on_failure = on_failure
-        self._session, self._keys = session, keys
-        self._robots, self._topics = tuple(robots), tuple(topics)
-        self._listener: QueuedListener | None = None
-        self._file: _McapFile | None = None
+        self._robots = robots
+        self._listener = QueuedListener(session, keys, robots, topics)
+        try:
+            self._file = _McapFile(path)
+        except DataError:
+            self._listener.close()
+            raise
         self._thread = Thread(target=self._run, name="omnibench-recorder", daemon=True)
+        self._thread.start()
 
     @property
     def messages(self) -> int:
@@ -192,12 +197,12 @@ class Recorder:
     @property
     def lost(self) -> int:
         """Messages dropped because the queue was full."""
-        return self._listener.lost if self._listener else 0
+        return self._listener.lost
 
     @property
     def missed(self) -> Counter[str]:
         """Messages that were published and never came, by ROS topic."""
-        return Counter(self._listener.missed if self._listener else {})
+        return Counter(self._listener.missed)
 
     @property
     def silent_robots(self) -> list[str]:
@@ -208,48 +213,26 @@ class Recorder:
     @property
     def bytes(self) -> int:
         """The file's size so far."""
-        return self._file.size if self._file else 0
+        return self._file.size
 
-    def start(self) -> None:
-        """Begin to record."""
-        listener = QueuedListener(self._session, self._keys, self._robots, self._topics)
-        try:
-            self._file = _McapFile(self.path)
-        except DataError:
-            listener.close()
-            raise
-        self._listener = listener
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Write what has arrived, and complete the file. Stopping twice does no harm."""
-        if self._listener is not None:
-            self._listener.close()
-            self._thread.join()
-
-    def __enter__(self) -> Recorder:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def close(self) -> None:
+        """Write what has arrived, and complete the file. Closing twice does no harm."""
+        self._listener.close()
+        self._thread.join()
 
     def _run(self) -> None:
-        listener, file = self._listener, self._file
-        assert listener is not None
-        assert file is not None
+        file, flush_at = self._file, time.monotonic() + _FLUSH_PERIOD
         try:
             file.mcap.flush()  # an empty file is valid too
-            flush_at = time.monotonic() + _FLUSH_PERIOD
-            for arrival in listener:
+            for arrival in self._listener:
                 if arrival is not None:
-                    self._add(file, arrival)
+                    self._add(arrival)
                 if file.chunk_complete or time.monotonic() >= flush_at:
                     file.mcap.flush()
                     flush_at = time.monotonic() + _FLUSH_PERIOD
             file.complete()
         except OSError as error:
-            listener.closed.set()
+            self._listener.closed.set()
             reason = error.strerror or str(error)
             self.failure = (
                 f"{self.path}: cannot be written: {reason}; the recording ends here, and what it holds can be read"
@@ -258,7 +241,7 @@ class Recorder:
         finally:
             file.close()
 
-    def _add(self, file: _McapFile, arrival: Arrival) -> None:
+    def _add(self, arrival: Arrival) -> None:
         """Add a message; its publish time is the stamp in its header, or else the time of its arrival."""
         kind, stamp = TOPICS[arrival.topic], -1
         try:
@@ -270,7 +253,8 @@ class Recorder:
             content = content.transforms[0] if content.transforms else None
         if content is not None:
             stamp = int(content.header.stamp.sec) * 1_000_000_000 + int(content.header.stamp.nanosec)
-        file.add(arrival.name, kind, arrival.payload, arrival.time, arrival.time if stamp < 0 else stamp)
+        published = arrival.time if stamp < 0 else stamp
+        self._file.add(arrival.name, kind, arrival.payload, arrival.time, published)
         self.counts[arrival.name] += 1
 
 

@@ -36,7 +36,7 @@ import zenoh
 from pydantic import Field, model_validator
 
 from omnibench.config import Model
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 from omnibench.live import wire
 from omnibench.live.presence import checked_robot
 from omnibench.live.stopping import direct
@@ -364,7 +364,10 @@ class TopicListener:
         self._consume = consume
         self._time = 0
         self._lock = Lock()
-        sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in _pairs(robots, topics)}
+        for topic in topics:
+            require_choice("topic", topic, TOPICS)
+        pairs = ((checked_robot(robot), topic) for robot in robots for topic in topics)
+        sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in pairs}
         self.topics = {name: topic for name, (_, topic) in sources.items()}  # all robots share tf
         self._missed = {name: wire.MissedMessages() for name in sources}
         self._subscribers: list[zenoh.Subscriber[None]] = []
@@ -393,13 +396,6 @@ class TopicListener:
                 return
             self._time = max(self._time, time.time_ns())  # readers of recordings expect increasing times
             self._consume(Arrival(name, topic, self._time, payload))
-
-
-def _pairs(robots: Sequence[str], topics: Sequence[str]) -> list[tuple[str, str]]:
-    for topic in topics:
-        if topic not in TOPICS:
-            raise UnknownNameError("topic", topic, TOPICS)
-    return [(checked_robot(robot), topic) for robot in robots for topic in topics]
 
 
 _ACKNOWLEDGEMENT: Final = struct.Struct("<Q?")

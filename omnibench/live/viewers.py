@@ -51,9 +51,7 @@ class FoxgloveServer(Closing):
         try:
             import foxglove
         except ImportError:
-            raise ConfigError(
-                'the Foxglove server needs the package foxglove-sdk: pip install "foxglove-sdk"'
-            ) from None
+            raise ConfigError('the Foxglove server needs foxglove-sdk: pip install "omnibench[foxglove]"') from None
         if not 0 <= port <= 65535:
             raise ConfigError(f"Foxglove server: port {port}: expected 0 to 65535")
         self._context = foxglove.Context()
@@ -159,7 +157,7 @@ class RerunView(Closing):
             import rerun
             from rerun import blueprint
         except ImportError:
-            raise ConfigError('Rerun needs the package rerun-sdk: pip install "omnibench[rerun]"') from None
+            raise ConfigError('Rerun needs rerun-sdk: pip install "omnibench[rerun]"') from None
         self._rerun, self._stream = rerun, rerun.RecordingStream("omnibench")
         if file is None:
             self._open_viewer()

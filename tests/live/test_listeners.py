@@ -285,7 +285,7 @@ def test_a_recording_holds_every_payload_of_every_topic_as_it_was_sent(loopback:
         for payload in sent[name]:
             publisher.put_encoded(payload)
     until(lambda: recorder.messages == 50 * len(TOPICS), "all messages")
-    recorder.stop()
+    recorder.close()
     assert messages_of(recorder.path) == sent
     assert dict(recorder.counts) == dict.fromkeys(sent, 50)
     assert recorder.bytes == recorder.path.stat().st_size
@@ -298,7 +298,7 @@ def test_times_in_a_recording_are_those_of_header_and_arrival(loopback: Loopback
     odom.put(sample("odom", 7))
     odom.put(sample("odom", 8))
     until(lambda: recorder.messages == 2, "all messages")
-    recorder.stop()
+    recorder.close()
     with recorder.path.open("rb") as file:
         first, second = [message for _, _, message in make_reader(file).iter_messages()]
     assert [first.publish_time, second.publish_time] == [STAMP + 7 * PERIOD, STAMP + 8 * PERIOD]
@@ -314,7 +314,7 @@ def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loop
         odom.put_encoded(broken)
     odom.put_encoded(whole)
     until(lambda: recorder.messages, "the message that can")
-    recorder.stop()
+    recorder.close()
     assert messages_of(recorder.path) == {"/apr02/odom": [whole]}
     assert recorder.undecodable == {"/apr02/odom": 5}
 
@@ -360,7 +360,7 @@ def test_what_cannot_be_recorded_is_named_and_no_file_changes(
 ) -> None:
     (tmp_path / "run.mcap").write_text("precious")
     with pytest.raises((DataError, ConfigError, UnknownNameError), match=named):
-        Recorder(loopback.client(), KEYS, [robot], tmp_path / file, *([topics] if topics else [])).start()
+        Recorder(loopback.client(), KEYS, [robot], tmp_path / file, *([topics] if topics else []))
     assert [each.read_text() for each in tmp_path.iterdir()] == ["precious"]
 
 
@@ -404,7 +404,7 @@ def test_a_repeated_message_is_recorded_once_and_lost_ones_counted(loopback: Loo
     for number in (1, 2, 2, 1, 3, 11):
         odom.put_numbered(TOPICS["odom"].encode(sample("odom", number)), number, (7, number, 1, False))
     until(lambda: recorder.messages == 4, "the four messages")
-    recorder.stop()
+    recorder.close()
     sent = [TOPICS["odom"].encode(sample("odom", number)) for number in (1, 2, 3, 11)]
     assert messages_of(recorder.path) == {"/apr02/odom": sent}
     assert recorder.missed == {"/apr02/odom": 7}
