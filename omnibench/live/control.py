@@ -20,7 +20,8 @@ from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic_core import from_json
 
 from omnibench.config import Model, parse_yaml, to_json, validate
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
@@ -51,15 +52,11 @@ class PoseOrder(Model):
 
 
 def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
-    """A pose from a payload in JSON or YAML or, without one, from the parameters. ConfigError in one line."""
+    """A pose from a payload in JSON or YAML or, without one, from the parameters. ConfigError or DataError."""
     where = "set_pose"
-    if not payload:
-        return validate(PoseOrder, parameters, where)
-    try:
-        text = payload.decode()
-    except UnicodeDecodeError:
-        raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
-    return validate(PoseOrder, parse_yaml(text, where, _MAX_POSE_VALUES), where)  # JSON is a part of YAML
+    # JSON is a part of YAML
+    content = parse_yaml(_text(payload, where), where, _MAX_POSE_VALUES) if payload else parameters
+    return validate(PoseOrder, content, where)
 
 
 def read_time(text: str) -> int:
@@ -81,11 +78,14 @@ def read_time(text: str) -> int:
 
 def read_sent_calibration(payload: bytes, where: str) -> Calibration:
     """Parse a calibration that came over the network. DataError begins with ``where`` and says what is wrong."""
+    return parse_calibration(_text(payload, where), where, _MAX_CALIBRATION_VALUES)
+
+
+def _text(payload: bytes, where: str) -> str:
     try:
-        text = payload.decode()
+        return payload.decode()
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text in UTF-8: {error}") from None
-    return parse_calibration(text, where, _MAX_CALIBRATION_VALUES)
+        raise DataError(f"{where}: not text in UTF-8: {error}") from None
 
 
 MOST_WAITING: Final = 64  # requests that wait; chosen
@@ -164,12 +164,6 @@ class SwapReply(BaseModel):
     reason: str = Field("", max_length=_LONGEST_TEXT)
 
 
-class _Refusal(BaseModel):
-    """A node's answer that refuses a calibration."""
-
-    error: str
-
-
 def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> SwapReply:
     """Send a calibration file to the node that runs ``robot``, and return its answer.
 
@@ -182,8 +176,8 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
             if reply.ok is not None:
                 return SwapReply.model_validate_json(reply.ok.payload.to_bytes())
             if reply.err is not None and (refusal := reply.err.payload.to_bytes()) != b"Timeout":
-                raise DataError(f"robot {robot!r} refuses {file}: {_Refusal.model_validate_json(refusal).error}")
-        except ValidationError:
+                raise DataError(f"robot {robot!r} refuses {file}: {from_json(refusal)['error']}")
+        except (ValueError, KeyError, TypeError):
             raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
     alive = alive_robots(session)
     if robot in alive:
@@ -249,34 +243,34 @@ class QueryServer:
     def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
         if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
             return  # an order must name its robot: wildcards are ignored
-        size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
-        self._queue(
+        request = Request(
             client_of(query, f"{name}/{service}"),
-            size,
             lambda: self._answer(name, service, query),
             lambda reason: _refuse(query, name, f"omnibench/{name}/{service}: {reason}"),
         )
+        self._queue(request, query, len(str(query.parameters)))
 
     def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
         """Take a calibration that was put: it has no reply, unlike ``swap``, so health and log report a refusal."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        self._queue(
+        request = Request(
             client_of(sample, f"{name}/put"),
-            _size(sample.payload) + _size(sample.attachment),
             lambda: self._swap(name, sample.payload.to_bytes()),
             lambda reason: self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}"),
         )
+        self._queue(request, sample)
 
-    def _queue(self, client: str, size: int, answer: Callable[[], object], refuse: Callable[[str], None]) -> None:
-        """Queue a request of ``size`` bytes, or refuse it or the one that gives way to it."""
-        request = Request(client, answer, refuse)
-        refused, reason = request, f"{size} bytes are more than a request may have, {LONGEST}"
-        if size <= LONGEST:
-            gives_way, reason = self._requests.put(request), f"{MOST_WAITING} requests are waiting; ask again later"
-            if gives_way is None:
-                return
-            refused = gives_way
+    def _queue(self, request: Request, message: zenoh.Query | zenoh.Sample, size: int = 0) -> None:
+        """Queue a request, or refuse it or the one that gives way to it. size: of its parameters, bytes."""
+        size += sum(len(part) for part in (message.payload, message.attachment) if part is not None)
+        refused: Request | None = request
+        if size > LONGEST:
+            reason = f"{size} bytes are more than a request may have, {LONGEST}"
+        else:
+            refused, reason = self._requests.put(request), f"{MOST_WAITING} requests are waiting; ask again later"
+        if refused is None:
+            return
         self._refused += 1
         if self._rate_limiter.allows("refused"):
             LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
@@ -371,10 +365,6 @@ class QueryServer:
             LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
             return answer | {"kept": False, "reason": str(error)}
         return answer | {"kept": True}
-
-
-def _size(content: zenoh.ZBytes | None) -> int:
-    return 0 if content is None else len(content)
 
 
 def _refuse(query: zenoh.Query, name: str, reason: str) -> None:

@@ -90,13 +90,10 @@ class Subscription(Closing):
         session: zenoh.Session | None,
         lossless: bool,
     ) -> None:
-        self.received = 0
-        self.undecodable = 0
-        self.callback_errors = 0
+        self.received = self.undecodable = self.callback_errors = 0
         self._subscriber = subscriber
         self._channel = subscriber.handler  # readers wait in the channel, so that the subscriber can be closed
         self._session = session
-        self._callback = callback
         self._lossless = lossless
         self._numbers = MissedMessages()
         self._log_limiter = RateLimiter(math.inf)
@@ -115,7 +112,7 @@ class Subscription(Closing):
         return self._numbers.count
 
     def __iter__(self) -> Iterator[Odometry]:
-        if self._callback is not None:
+        if self._thread is not None:
             raise ConfigError("this subscription hands its messages to a callback; iterate over one without")
         return self._messages()
 

@@ -219,7 +219,7 @@ class RerunView(Closing):
             if arrival is None:
                 continue
             robot, topic = arrival.name.split("/")[1], arrival.topic
-            with suppress(MessageError):  # who records or fuses such a message counts it
+            with suppress(MessageError, np.linalg.LinAlgError):  # who records or fuses such a message counts it
                 if topic == "slam_pose":
                     self._show_pose(robot, POSE_ESTIMATE.decode(arrival.payload))
                 elif topic == "diagnostics":
