@@ -132,6 +132,7 @@ def foxglove_layout(config: LiveConfig) -> str:
 _PERIOD: Final = 200_000_000  # ns of the stamps between two poses that Rerun gets, each of which takes it 1 ms; chosen
 _ELLIPSES: Final = 5_000_000_000  # ns between two ellipses along a path; chosen
 _HISTORY: Final = 1000  # fused poses with which SLAM's can be compared, 10 s at 100 Hz; chosen
+_UNKNOWN: Final = 50.0  # m: a filter that SLAM has not located yet has a standard deviation of 100 m
 _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 33)  # angles of the points of an ellipse, rad
 _WITHIN: Final = math.sqrt(5.991)  # standard deviations that hold 95 % in the plane (chi-square, 2 degrees of freedom)
 _VIEWER_PORT: Final = 9876  # Rerun's default
@@ -239,6 +240,8 @@ class RerunView(Closing):
         """Show odom or filtered."""
         rerun, log, entity = self._rerun, self._stream.log, f"{robot}/{name}"
         if name == "filtered":
+            if message.position_sigma > _UNKNOWN:
+                return
             self._fused[robot].append(message)
         if not self._is_due(entity, message.stamp, _PERIOD):
             return
@@ -246,11 +249,10 @@ class RerunView(Closing):
         self._newest[entity] = message
         odom = self._newest.get(f"{robot}/odom", message)
         if robot not in self._laid and odom is not message and odom.stamp == message.stamp:
+            self._laid.add(robot)
             x, y, heading = correction(message.pose, odom.pose).tolist()
-            if x or y or heading:  # SLAM has said where the robot is
-                self._laid.add(robot)
-                turn = rerun.RotationAxisAngle(axis=[0, 0, 1], radians=heading)
-                log(f"{robot}/odom", rerun.Transform3D(translation=[x, y, 0], rotation=turn), static=True)
+            turn = rerun.RotationAxisAngle(axis=[0, 0, 1], radians=heading)
+            log(f"{robot}/odom", rerun.Transform3D(translation=[x, y, 0], rotation=turn), static=True)
         log(entity, rerun.LineStrips3D([_at_floor(np.stack([before.pose, message.pose])[:, :2])]))
         log(f"{robot}/sigma/position/{name}", rerun.Scalars(message.position_sigma))
         log(f"{robot}/sigma/heading/{name}", rerun.Scalars(math.degrees(message.heading_sigma)))
@@ -270,7 +272,8 @@ class RerunView(Closing):
         if before:  # carried on to the pose's stamp by its twist
             expected = compose(before[-1].pose, before[-1].twist * ((message.stamp - before[-1].stamp) / 1e9))
             x, y, heading = innovation_of(pose, expected).tolist()
-            log(f"{robot}/innovation/position", rerun.Scalars([x, y]))
+            log(f"{robot}/innovation/position/x", rerun.Scalars(x))
+            log(f"{robot}/innovation/position/y", rerun.Scalars(y))
             log(f"{robot}/innovation/heading", rerun.Scalars(math.degrees(heading)))
 
     def _show_diagnostics(self, robot: str, message: Diagnostics) -> None:

@@ -546,6 +546,7 @@ def test_rerun_gets_paths_covariances_innovations_and_health(loopback: Loopback,
     file = tmp_path / "shown" / "drive.rrd"
     with RerunView(loopback.client(), KEYS, {"apr02": mount}, file) as view:
         wait_for_subscribers(*(each[topic] for topic in ("odom", "odometry/filtered", "slam_pose", "diagnostics")))
+        each["odometry/filtered"].put(replace(odometry(-10), pose_covariance=1e4 * np.eye(3)))  # not located yet
         for k in range(0, 100, 10):
             each["odom"].put(odometry(k))
             fused = odometry(k, "map")
@@ -560,8 +561,8 @@ def test_rerun_gets_paths_covariances_innovations_and_health(loopback: Loopback,
         batch = part.to_record_batch().to_pydict()
         for name, values in batch.items():
             columns.setdefault(f"{part.entity_path} {name.rpartition(':')[2]}", []).extend(values)
-    np.testing.assert_allclose(columns["/apr02/innovation/position scalars"], [[0.03 - 0.012, -0.05]], atol=1e-9)
-    np.testing.assert_allclose(columns["/apr02/innovation/heading scalars"], [[-math.degrees(0.045)]], atol=1e-9)
+    innovation = [columns[f"/apr02/innovation/{each} scalars"] for each in ("position/x", "position/y", "heading")]
+    np.testing.assert_allclose(innovation, [[[0.03 - 0.012]], [[-0.05]], [[-math.degrees(0.045)]]], atol=1e-9)
     paths = {name: np.array(columns[f"/apr02/{name} strips"])[:, 0, :, :2] for name in ("odom", "filtered")}
     np.testing.assert_allclose(paths["filtered"][1:, 1] - paths["filtered"][1:, 0], [[0.0, 2.0]] * 4, atol=1e-6)
     assert np.array_equal(paths["odom"][1:, 0], paths["odom"][:-1, 1])  # without gaps
