@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice
 from omnibench.live.drive import ReplayConfig
 from omnibench.live.fusion import FusionSettings
 from omnibench.live.session_config import SessionConfig
@@ -142,9 +142,9 @@ def client_session(node: SessionConfig) -> SessionConfig:
 
 def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:
     """The robot of that name, or the first one. UnknownNameError, or ConfigError when there is none."""
-    if not config.robots:
+    robots = {robot.name: robot for robot in config.robots}
+    if not robots:
         raise ConfigError("the config has no robot")
-    for robot in config.robots:
-        if name in (None, robot.name):
-            return robot
-    raise UnknownNameError("robot", str(name), [robot.name for robot in config.robots])
+    if name is not None:
+        require_choice("robot", name, robots)
+    return robots[name or next(iter(robots))]

@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Final, get_args
 
 import zenoh
@@ -120,17 +121,16 @@ class Subscription(Closing):
         """The newest message that was not returned before; waits up to ``timeout`` s, then None."""
         deadline = time.monotonic() + timeout
         newest = None
-        try:
+        with suppress(zenoh.ZError):  # the subscription was closed
             while True:
                 sample = self._channel.try_recv()
                 if sample is not None:
                     newest = self._decoded(sample) or newest
                 elif newest is not None or time.monotonic() >= deadline:
-                    return newest
+                    break
                 else:
                     time.sleep(_POLL_PERIOD)
-        except zenoh.ZError:  # the subscription was closed
-            return newest
+        return newest
 
     def close(self) -> None:
         """End the stream, also for a reader that waits for a message. Closing twice does no harm."""
@@ -144,14 +144,11 @@ class Subscription(Closing):
             self._thread.join()
 
     def _messages(self) -> Iterator[Odometry]:
-        while True:
-            try:
-                sample = self._channel.recv()
-            except zenoh.ZError:  # the subscription was closed
-                return
-            message = self._decoded(sample)
-            if message is not None:
-                yield message
+        with suppress(zenoh.ZError):  # the subscription was closed
+            while True:
+                message = self._decoded(self._channel.recv())
+                if message is not None:
+                    yield message
 
     def _decoded(self, sample: zenoh.Sample) -> Odometry | None:
         if sample.kind != zenoh.SampleKind.PUT:

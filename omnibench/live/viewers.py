@@ -8,7 +8,6 @@ import math
 import socket
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from omnibench.errors import ConfigError, DataError
 from omnibench.live.fusion import innovation_of
 from omnibench.live.odometry import RobotCentre
 from omnibench.live.record import QueuedListener
-from omnibench.live.stopping import Closing
+from omnibench.live.stopping import Closing, wait_until
 from omnibench.live.topics import TOPICS, Arrival, KeySpace, TopicListener
 from omnibench.live.wire import DIAGNOSTICS, ODOMETRY, POSE_ESTIMATE, Diagnostics, MessageError, Odometry, PoseEstimate
 from omnibench.robot.kinematics import Array, Mount, compose, correction
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
 
 PORT: Final = 8765  # the application's default
-STOPPING_S: Final = 5.0  # how long ``close`` waits for its port; without load it is free after some milliseconds
+_STOPPING: Final = 5.0  # how long ``close`` waits for its port; without load it is free after some milliseconds
 
 
 class FoxgloveServer(Closing):
@@ -90,23 +89,20 @@ class FoxgloveServer(Closing):
         for listener in self._listeners:
             listener.close()
         self._server.stop()  # asks the server's threads to stop, and does not wait for them
-        end = time.monotonic() + STOPPING_S
-        while _in_use(self._host, self._port) and time.monotonic() < end:
-            time.sleep(0.002)
+        family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+
+        def is_free() -> bool:
+            try:
+                socket.create_server((self._host, self._port), family=family).close()
+            except OSError as error:
+                return error.errno != errno.EADDRINUSE
+            return True
+
+        wait_until(is_free, _STOPPING, period=0.002)
 
     def _forward(self, arrival: Arrival) -> None:
-        channel = self._channels.get(arrival.name)
-        if channel is not None:
+        if channel := self._channels.get(arrival.name):
             channel.log(arrival.payload, log_time=arrival.time)
-
-
-def _in_use(host: str, port: int) -> bool:
-    """True if a program listens there, whatever the state of the connections that it had."""
-    try:
-        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-    except OSError as error:
-        return error.errno == errno.EADDRINUSE
-    return False
 
 
 def foxglove_layout(config: LiveConfig) -> str:
