@@ -30,11 +30,12 @@ from omnibench.live.delivery import AcknowledgedFlows
 from omnibench.live.health import Counts, Health, anomalies_in_words, diagnostic
 from omnibench.live.network import close_session, open_session
 from omnibench.live.presence import Claim
-from omnibench.live.record import PORT, FoxgloveServer, Recorder, free_path
+from omnibench.live.record import Recorder, free_path
 from omnibench.live.state import RobotMemory
 from omnibench.live.stopping import Closing, RateLimiter, Stop
 from omnibench.live.topics import OUTPUTS, TOPICS, GraphNode, KeySpace, Update
 from omnibench.live.tracker import RobotTracker
+from omnibench.live.viewers import PORT, FoxgloveServer, RerunView
 from omnibench.live.wire import Diagnostics, Flow, MissedMessages, flow_of
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
@@ -403,6 +404,7 @@ class LiveNode(Closing):
             self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
             self._serve_foxglove(listeners)
+            self._show_in_rerun(listeners)
             self._record(listeners)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
@@ -462,6 +464,15 @@ class LiveNode(Closing):
         server.forward(self.session, self.keys, list(self.trackers))
         listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
         LOG.warning("Foxglove: open %s", server.address)
+
+    def _show_in_rerun(self, listeners: ExitStack) -> None:
+        """Show the robots in Rerun, if the config asks for it; in a new file where the config's is there already."""
+        if self.config.rerun is False:
+            return
+        file = None if self.config.rerun is True else free_path(self.config.rerun)
+        mounts = {name: tracker.calibration.robot.mount for name, tracker in self.trackers.items()}
+        listeners.enter_context(RerunView(self.session, self.keys, mounts, file))
+        LOG.warning("Rerun: %s", file or "the viewer is open")
 
     def _record(self, listeners: ExitStack) -> None:
         """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""

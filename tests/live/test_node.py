@@ -324,7 +324,7 @@ def test_a_recorder_or_server_that_cannot_begin_is_named(tmp_path: Path, monkeyp
             assert not (tmp_path / "run.mcap").exists()
             assert_nothing_is_open(config)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # what an absent package looks like
-    with pytest.raises(ConfigError, match='pip install "foxglove-sdk"'):
+    with pytest.raises(ConfigError, match=r'pip install "omnibench\[foxglove\]"'):
         LiveNode(config_of(tmp_path, foxglove=True))
 
 
@@ -351,9 +351,9 @@ def test_a_waiting_replay_finds_the_node_before_its_recorder(tmp_path: Path, mon
     alive: list[tuple[str, ...]] = []
 
     class LateRecorder(Recorder):
-        def start(self) -> None:
-            alive.append(alive_robots(self._session, 1.0))
-            super().start()
+        def __init__(self, session: zenoh.Session, *others: Any, **options: Any) -> None:
+            alive.append(alive_robots(session, 1.0))
+            super().__init__(session, *others, **options)
 
     monkeypatch.setattr("omnibench.live.node.Recorder", LateRecorder)
     driven(config_of(tmp_path, record="run.mcap"), 0.1)
