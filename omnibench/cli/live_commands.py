@@ -13,7 +13,7 @@ from omnibench.cli.options import argument, flag, option, output_option
 from omnibench.cli.terminal.console import make_console, print_ending, print_next, warn
 from omnibench.cli.terminal.progress_display import ProgressDisplay
 from omnibench.errors import ConfigError
-from omnibench.files import refuse_existing, remove
+from omnibench.files import refuse_existing, remove, write_text
 
 if TYPE_CHECKING:
     from omnibench.live.config import LiveConfig
@@ -39,6 +39,8 @@ def live(
     replay: bool = flag("Play a recording to the node, show its errors, and end.", "--replay"),
     speed: str | None = option("Speed of the replay: 1, 10, ... or max. Default: the config's."),
     foxglove: bool = flag("Serve Foxglove's WebSocket on this computer.", "--foxglove"),
+    layout: Path | None = option("Write a layout for Foxglove, to import there.", metavar="FILE.json"),
+    rerun: bool = flag("Show the robots in Rerun; the config can name a file for it.", "--rerun"),
     seconds: float | None = _SECONDS,
     plugins: list[Path] | None = shared.PLUGINS,
 ) -> None:
@@ -52,8 +54,13 @@ def live(
         config, dataset = dataset, config
     chosen = read_live_config(config)
     chosen = chosen.model_copy(update={"plugins": (*chosen.plugins, *shared.plugin_folders(plugins))})
-    if foxglove and not chosen.foxglove:
-        chosen = chosen.model_copy(update={"foxglove": True})
+    asked = {"foxglove": foxglove and not chosen.foxglove, "rerun": rerun and not chosen.rerun}
+    chosen = chosen.model_copy(update={key: True for key, is_asked in asked.items() if is_asked})
+    if layout is not None:
+        from omnibench.live.viewers import foxglove_layout
+
+        refuse_existing(layout, force=False)
+        write_text(layout, foxglove_layout(chosen))
     if not replay:
         if dataset is not None or speed is not None:
             raise ConfigError(f"{dataset or '--speed'}: is for a replay only; add --replay")
@@ -256,8 +263,7 @@ def _client(file: Path | None, connect: str | None, profile: Any, purpose: str) 
     """A client's session, and the keys of the profile."""
     from omnibench.config import validate
     from omnibench.live.config import ClientConfig, read_client_config
-    from omnibench.live.network import close_session, open_session
-    from omnibench.live.session_config import SessionConfig
+    from omnibench.live.network import SessionConfig, close_session, open_session
     from omnibench.live.topics import KeySpace
 
     chosen: ClientConfig = ClientConfig() if file is None else read_client_config(file)

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from omnibench.config import Model, Positive, RelativePath, read_model, read_yaml, validate
-from omnibench.errors import ConfigError, UnknownNameError
+from omnibench.errors import ConfigError, require_choice
 from omnibench.live.drive import ReplayConfig
 from omnibench.live.fusion import FusionSettings
-from omnibench.live.session_config import SessionConfig
+from omnibench.live.network import SessionConfig
 from omnibench.live.topics import Frames, Profile
 from omnibench.live.wheels import WheelSettings
 
@@ -65,14 +65,16 @@ class LiveConfig(Model):
     state: RelativePath | None = Field(None, description="folder in which pose and calibration outlive the node")
     record: RelativePath | None = Field(None, description="MCAP file to record to")
     foxglove: bool | int = Field(False, description="serve Foxglove's WebSocket on loopback; a number is the port")
+    rerun: bool | RelativePath = Field(False, description="show in Rerun's viewer (true), or record for it (FILE.rrd)")
     replay: ReplaySource = ReplaySource()
 
-    @field_validator("record")
+    @field_validator("record", "rerun")
     @classmethod
-    def _is_mcap(cls, record: Path | None) -> Path | None:
-        if record is not None and record.suffix != ".mcap":
-            raise ValueError(f"{str(record)!r}: name a file that ends in .mcap")
-        return record
+    def _has_suffix(cls, file: Path | bool | None, info: ValidationInfo) -> Path | bool | None:
+        suffix = ".mcap" if info.field_name == "record" else ".rrd"
+        if isinstance(file, Path) and file.suffix != suffix:
+            raise ValueError(f"{str(file)!r}: name a file that ends in {suffix}")
+        return file
 
     @model_validator(mode="after")
     def _robots_differ(self) -> LiveConfig:
@@ -140,9 +142,9 @@ def client_session(node: SessionConfig) -> SessionConfig:
 
 def robot_called(config: LiveConfig, name: str | None) -> RobotConfig:
     """The robot of that name, or the first one. UnknownNameError, or ConfigError when there is none."""
-    if not config.robots:
+    robots = {robot.name: robot for robot in config.robots}
+    if not robots:
         raise ConfigError("the config has no robot")
-    for robot in config.robots:
-        if name in (None, robot.name):
-            return robot
-    raise UnknownNameError("robot", str(name), [robot.name for robot in config.robots])
+    if name is not None:
+        require_choice("robot", name, robots)
+    return robots[name or next(iter(robots))]

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import partial
-from itertools import chain, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic_core import from_json
 
 from omnibench.config import Model, parse_yaml, to_json, validate
 from omnibench.errors import ConfigError, DataError, OmnibenchError, one_line
@@ -51,15 +52,11 @@ class PoseOrder(Model):
 
 
 def read_pose(payload: bytes, parameters: dict[str, str]) -> PoseOrder:
-    """A pose from a payload in JSON or YAML or, without one, from the parameters. ConfigError in one line."""
+    """A pose from a payload in JSON or YAML or, without one, from the parameters. ConfigError or DataError."""
     where = "set_pose"
-    if not payload:
-        return validate(PoseOrder, parameters, where)
-    try:
-        text = payload.decode()
-    except UnicodeDecodeError:
-        raise ConfigError(f"{where}: the payload is not text; send x, y (m) and theta (rad) in JSON") from None
-    return validate(PoseOrder, parse_yaml(text, where, _MAX_POSE_VALUES), where)  # JSON is a part of YAML
+    # JSON is a part of YAML
+    content = parse_yaml(_text(payload, where), where, _MAX_POSE_VALUES) if payload else parameters
+    return validate(PoseOrder, content, where)
 
 
 def read_time(text: str) -> int:
@@ -81,11 +78,14 @@ def read_time(text: str) -> int:
 
 def read_sent_calibration(payload: bytes, where: str) -> Calibration:
     """Parse a calibration that came over the network. DataError begins with ``where`` and says what is wrong."""
+    return parse_calibration(_text(payload, where), where, _MAX_CALIBRATION_VALUES)
+
+
+def _text(payload: bytes, where: str) -> str:
     try:
-        text = payload.decode()
+        return payload.decode()
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text in UTF-8: {error}") from None
-    return parse_calibration(text, where, _MAX_CALIBRATION_VALUES)
+        raise DataError(f"{where}: not text in UTF-8: {error}") from None
 
 
 MOST_WAITING: Final = 64  # requests that wait; chosen
@@ -106,7 +106,7 @@ class Request:
     """A request that waits. client: its lane; answer: serve it; refuse: answer with a reason instead."""
 
     client: str
-    answer: Callable[[], None]
+    answer: Callable[[], object]
     refuse: Callable[[str], None]
 
 
@@ -117,8 +117,7 @@ class RequestQueue:
     """
 
     def __init__(self) -> None:
-        self._lanes: dict[str, deque[Request]] = {}
-        self._count = 0
+        self._lanes: dict[str, list[Request]] = {}  # of each client, none empty
         self._closed = False
         self._changed = threading.Condition()
 
@@ -127,24 +126,22 @@ class RequestQueue:
         with self._changed:
             if self._closed:
                 return request
-            excess = None
-            if self._count >= MOST_WAITING:
-                longest = max(self._lanes, key=lambda client: len(self._lanes[client]))
-                if len(self._lanes[longest]) - len(self._lanes.get(request.client, ())) <= 1:
-                    return request
-                excess = self._lanes[longest].pop()
-                self._count -= 1
-            self._lanes.setdefault(request.client, deque()).append(request)
-            self._count += 1
+            own = self._lanes.setdefault(request.client, [])
+            own.append(request)
             self._changed.notify()
-            return excess
+            if sum(map(len, self._lanes.values())) <= MOST_WAITING:
+                return None
+            client, longest = max(self._lanes.items(), key=lambda lane: (len(lane[1]), lane[1] is own))
+            if len(longest) == 1:
+                del self._lanes[client]
+            return longest.pop()
 
     def take(self) -> list[Request]:
         """All requests that wait, each client's first before anybody's second; empty when the queue is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._count or self._closed)
-            lanes, self._lanes, self._count = list(self._lanes.values()), {}, 0
-        return [request for request in chain.from_iterable(zip_longest(*lanes)) if request is not None]
+            self._changed.wait_for(lambda: self._lanes or self._closed)
+            lanes, self._lanes = self._lanes.values(), {}
+        return [request for turn in zip_longest(*lanes) for request in turn if request is not None]
 
     def close(self) -> None:
         """Take no more requests; those that wait are still given out."""
@@ -167,12 +164,6 @@ class SwapReply(BaseModel):
     reason: str = Field("", max_length=_LONGEST_TEXT)
 
 
-class _Refusal(BaseModel):
-    """A node's answer that refuses a calibration."""
-
-    error: str
-
-
 def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: float = 10.0) -> SwapReply:
     """Send a calibration file to the node that runs ``robot``, and return its answer.
 
@@ -185,8 +176,8 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
             if reply.ok is not None:
                 return SwapReply.model_validate_json(reply.ok.payload.to_bytes())
             if reply.err is not None and (refusal := reply.err.payload.to_bytes()) != b"Timeout":
-                raise DataError(f"robot {robot!r} refuses {file}: {_Refusal.model_validate_json(refusal).error}")
-        except ValidationError:
+                raise DataError(f"robot {robot!r} refuses {file}: {from_json(refusal)['error']}")
+        except (ValueError, KeyError, TypeError):
             raise DataError(f"robot {robot!r}: cannot read its node's answer; is it an omnibench node?") from None
     alive = alive_robots(session)
     if robot in alive:
@@ -200,6 +191,7 @@ def swap_calibration(session: zenoh.Session, robot: str, file: Path, timeout: fl
 LOG = logging.getLogger("omnibench.live")
 _READING: Final = ("info", "calibration", "health", "pose")
 _ORDERS: Final = ("set_pose", "reset", "swap")
+# The reason why the node's next start does not use a calibration that was swapped in.
 _NO_STATE: Final = "the node has no `state`, so that its next start is with the config's calibration"
 _CLOSE_TIMEOUT: Final = 6.0  # s to wait for a request under way: longer than Zenoh waits for a client, 5 s
 
@@ -229,7 +221,7 @@ class QueryServer:
         self._rate_limiter = RateLimiter()
         self._refused = 0
         self._requests = RequestQueue()
-        self._answers: dict[tuple[str, str], bytes] = {}  # robot, service -> answer, for the requests taken together
+        self._answers: dict[str, bytes] = {}  # key -> answer, for the requests taken together, until an order
         self._thread = threading.Thread(target=self._run, name="query server", daemon=True)
         self._declarations: list[Any] = []
         for name in trackers:
@@ -251,39 +243,38 @@ class QueryServer:
     def _take_query(self, name: str, service: str, query: zenoh.Query) -> None:
         if service in _ORDERS and str(query.key_expr) != f"omnibench/{name}/{service}":
             return  # an order must name its robot: wildcards are ignored
-        size = _size(query.payload) + _size(query.attachment) + len(str(query.parameters))
-        self._queue(
+        request = Request(
             client_of(query, f"{name}/{service}"),
-            size,
             lambda: self._answer(name, service, query),
             lambda reason: _refuse(query, name, f"omnibench/{name}/{service}: {reason}"),
         )
+        self._queue(request, query, len(str(query.parameters)))
 
     def _take_sample(self, name: str, sample: zenoh.Sample) -> None:
         """Take a calibration that was put: it has no reply, unlike ``swap``, so health and log report a refusal."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        self._queue(
+        request = Request(
             client_of(sample, f"{name}/put"),
-            _size(sample.payload) + _size(sample.attachment),
-            lambda: self._take_calibration(name, sample),
+            lambda: self._swap(name, sample.payload.to_bytes()),
             lambda reason: self._trackers[name].refuse_swap(f"omnibench/{name}/calibration: {reason}"),
         )
+        self._queue(request, sample)
 
-    def _queue(self, client: str, size: int, answer: Callable[[], None], refuse: Callable[[str], None]) -> None:
-        """Queue a request of ``size`` bytes, or refuse it or the one that gives way to it."""
-        request = Request(client, answer, refuse)
+    def _queue(self, request: Request, message: zenoh.Query | zenoh.Sample, size: int = 0) -> None:
+        """Queue a request, or refuse it or the one that gives way to it. size: of its parameters, bytes."""
+        size += sum(len(part) for part in (message.payload, message.attachment) if part is not None)
         refused: Request | None = request
         if size > LONGEST:
             reason = f"{size} bytes are more than a request may have, {LONGEST}"
         else:
-            reason = f"{MOST_WAITING} requests are waiting; ask again later"
-            refused = self._requests.put(request)
-        if refused is not None:
-            self._refused += 1
-            if self._rate_limiter.allows("refused"):
-                LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
-            refused.refuse(reason)
+            refused, reason = self._requests.put(request), f"{MOST_WAITING} requests are waiting; ask again later"
+        if refused is None:
+            return
+        self._refused += 1
+        if self._rate_limiter.allows("refused"):
+            LOG.warning("requests refused so far: %d; the last: %s", self._refused, reason)
+        refused.refuse(reason)
 
     def _run(self) -> None:
         while batch := deque(self._requests.take()):
@@ -291,54 +282,49 @@ class QueryServer:
             while batch:
                 try:
                     batch.popleft().answer()  # a query ends when the last reference to it is gone
+                except OmnibenchError:
+                    pass  # a calibration that was put and refused, which is logged
                 except Exception as error:  # whatever it was, the next request is answered
-                    self._failed(error)
-
-    def _failed(self, error: Exception) -> None:
-        if self._rate_limiter.allows(type(error).__name__):
-            LOG.error("a request failed: %s: %s", type(error).__name__, one_line(str(error)))
+                    if self._rate_limiter.allows(type(error).__name__):
+                        LOG.error("a request failed: %s: %s", type(error).__name__, one_line(str(error)))
 
     def _answer(self, name: str, service: str, query: zenoh.Query) -> None:
+        """Answer a query; an answer that needs no parameters is made once for all that wait for it."""
+        key = f"omnibench/{name}/{service}"
         with query:
+            plain = service in _READING and not str(query.parameters) and query.payload is None
+            answer = self._answers.get(key) if plain else None
             try:
-                answer = self._made(name, service, query)
+                if answer is None:
+                    answer = to_json(self._serve(name, service, query)).encode()
             except OmnibenchError as error:
                 _refuse(query, name, str(error))
+                return
             except Exception as error:
-                _refuse(query, name, f"omnibench/{name}/{service}: {type(error).__name__}: {error}")
-                self._failed(error)
-            else:
-                query.reply(f"omnibench/{name}/{service}", answer, encoding=zenoh.Encoding.APPLICATION_JSON)
-
-    def _made(self, name: str, service: str, query: zenoh.Query) -> bytes:
-        """The answer in JSON. One without parameters is made once for all that wait for it; an order changes them."""
-        plain = service in _READING and not str(query.parameters) and query.payload is None
-        answer = self._answers.get((name, service)) if plain else None
-        if answer is None:
-            answer = to_json(self._serve(name, service, query)).encode()
-        if plain:
-            self._answers[name, service] = answer
-        elif service in _ORDERS:
-            self._answers.clear()
-        return answer
+                _refuse(query, name, f"{key}: {type(error).__name__}: {error}")
+                raise
+            if plain:
+                self._answers[key] = answer
+            query.reply(key, answer, encoding=zenoh.Encoding.APPLICATION_JSON)
 
     def _serve(self, name: str, service: str, query: zenoh.Query) -> Mapping[str, Any] | Model:
         tracker = self._trackers[name]
         payload = b"" if query.payload is None else query.payload.to_bytes()
         parameters = dict(cast(Iterable[tuple[str, str]], query.parameters))
+        if service in _ORDERS:
+            self._answers.clear()
         if service == "info":
             return self._info(tracker)
         if service == "health":
             return tracker.health(time.monotonic())
         if service == "pose":
             estimate = tracker.pose_at(read_time(parameters["at"]) if "at" in parameters else None)
-            answer: dict[str, Any] = {"robot": tracker.name, "at": estimate.stamp / 1e9, "at_ns": estimate.stamp}
-            answer["odom"] = _planar(estimate.odometry)
-            answer["map"] = None
+            in_map: dict[str, Any] | None = None
             if estimate.in_map is not None:
                 pose, covariance = estimate.in_map
-                answer["map"] = _planar(pose) | {"covariance": covariance.tolist()}
-            return answer
+                in_map = {**_planar(pose), "covariance": covariance.tolist()}
+            times = {"at": estimate.stamp / 1e9, "at_ns": estimate.stamp}
+            return {"robot": name, **times, "odom": _planar(estimate.odometry), "map": in_map}
         if service == "calibration":
             if payload:  # the right to query this key must not be a right to swap the calibration
                 raise ConfigError(f"omnibench/{name}/calibration: put it there, or ask omnibench/{name}/swap with it")
@@ -355,45 +341,30 @@ class QueryServer:
         LOG.info("%s: filter reset", name)
         return {"robot": name, "done": "reset"}
 
-    def _take_calibration(self, name: str, sample: zenoh.Sample) -> None:
-        self._answers.clear()
-        try:
-            self._swap(name, sample.payload.to_bytes())
-        except OmnibenchError:
-            return  # logged already
-
     def _swap(self, name: str, payload: bytes) -> Mapping[str, Any]:
+        self._answers.clear()
         tracker = self._trackers[name]
         try:
-            calibration = read_sent_calibration(payload, f"omnibench/{name}/calibration")
-        except DataError as error:
-            tracker.refuse_swap(str(error))
-            self._log_refusal(tracker, error)
-            raise
-        try:
+            try:
+                calibration = read_sent_calibration(payload, f"omnibench/{name}/calibration")
+            except DataError as error:
+                tracker.refuse_swap(str(error))
+                raise
             tracker.swap(calibration)
         except DataError as error:
-            self._log_refusal(tracker, error)
+            if self._rate_limiter.allows(f"calibration of {name}"):
+                LOG.warning("%s: calibration refused, %s runs on: %s", name, tracker.calibration.name, error)
             raise
         LOG.info("%s: calibration %r runs", name, calibration.name)
-        # Save it; the reason where the node's next start will not use it.
-        reason = None if name in self._memories else _NO_STATE
-        if name in self._memories:
-            try:
-                self._memories[name].keep_calibration(calibration)
-            except OmnibenchError as error:
-                LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
-                reason = str(error)
-        answer = {"robot": name, "accepted": True, "calibration": calibration.name, "kept": reason is None}
-        return answer if reason is None else answer | {"reason": reason}
-
-    def _log_refusal(self, tracker: RobotTracker, error: DataError) -> None:
-        if self._rate_limiter.allows(f"calibration of {tracker.name}"):
-            LOG.warning("%s: calibration refused, %s runs on: %s", tracker.name, tracker.calibration.name, error)
-
-
-def _size(content: zenoh.ZBytes | None) -> int:
-    return 0 if content is None else len(content)
+        answer = {"robot": name, "accepted": True, "calibration": calibration.name}
+        if name not in self._memories:
+            return answer | {"kept": False, "reason": _NO_STATE}
+        try:
+            self._memories[name].keep_calibration(calibration)
+        except OmnibenchError as error:
+            LOG.warning("%s: calibration %r runs, but not after a restart: %s", name, calibration.name, error)
+            return answer | {"kept": False, "reason": str(error)}
+        return answer | {"kept": True}
 
 
 def _refuse(query: zenoh.Query, name: str, reason: str) -> None:

@@ -4,38 +4,36 @@ from __future__ import annotations
 
 import math
 import threading
-import time
-from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
-import zenoh
+from numpy.typing import NDArray
 
 from omnibench.live.config import LiveConfig, client_session, robot_called
-from omnibench.live.drive import (
-    ConcatenatedDrive,
-    Recording,
-    concatenate_recording,
-    concatenated_truth,
-)
+from omnibench.live.delivery import DeliveryError
+from omnibench.live.drive import Recording, concatenate_recording, concatenated_truth
 from omnibench.live.health import Health
 from omnibench.live.network import close_session, open_session
 from omnibench.live.node import LiveNode, load_effects
 from omnibench.live.odometry import RobotCentre
-from omnibench.live.replay import WINDOW, DeliveryError, Player, PlayReport
+from omnibench.live.replay import Player, PlayReport
 from omnibench.live.stopping import wait_until
-from omnibench.live.subscriber import Subscription, subscribe
+from omnibench.live.subscriber import subscribe
 from omnibench.live.topics import GraphNode
-from omnibench.live.tracker import RobotTracker
 from omnibench.live.wheels import joints_of
 from omnibench.live.wire import Odometry
 from omnibench.progress import Progress, Reporter, no_progress
-from omnibench.robot.calibration import Calibration, read_calibration
+from omnibench.robot.calibration import read_calibration
 from omnibench.robot.kinematics import Array, interpolated, moved_to
 from omnibench.robot.model import OdometryModel
 from omnibench.words import plural
 
-_LAST_MESSAGES = 5.0  # s without any of the messages under way after which they count as lost; chosen
+_FUSED: Final = "odometry/filtered"
+_LAST_MESSAGES: Final = 30.0  # s for the messages that wait in the queues at the end; chosen
+
+_Received = list[tuple[int, Array]]  # stamps, ns, and poses (3,) of one topic, by arrival
 
 
 @dataclass(frozen=True)
@@ -68,60 +66,6 @@ class Demonstration:
     health: Health
 
 
-class _Collector:
-    """Collects the messages of one topic in the order of arrival. stamps: ns; poses (K, 3) with continuous headings."""
-
-    def __init__(self, session: zenoh.Session, robot: str, topic: str, config: LiveConfig) -> None:
-        self.stamps: list[int] = []
-        self._poses: list[Array] = []
-        self._subscription: Subscription = subscribe(
-            robot,
-            topic=topic,
-            session=session,
-            profile=config.profile,
-            domain=config.domain,
-            callback=self._take,
-            lossless=True,
-        )
-
-    def _take(self, message: Odometry) -> None:
-        self._poses.append(message.pose)
-        self.stamps.append(message.stamp)
-
-    @property
-    def poses(self) -> Array:
-        poses = np.array(self._poses).reshape(-1, 3)
-        return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])])  # messages hold quaternions
-
-    def close(self) -> None:
-        self._subscription.close()
-
-
-class _Results:
-    """The node's messages on their way to the collectors, of which no more than ``WINDOW`` are to be under way."""
-
-    def __init__(self, tracker: RobotTracker, collectors: Sequence[_Collector]) -> None:
-        self._counts, self._collectors = tracker.counts, collectors
-        self._missing, self._changed_at = 0, time.monotonic()
-
-    def behind(self) -> bool:
-        """True while so many messages are under way that more could be lost; False once they seem lost."""
-        missing = self._missing_now()
-        if missing != self._missing:
-            self._missing, self._changed_at = missing, time.monotonic()
-        return missing > WINDOW and time.monotonic() - self._changed_at < _LAST_MESSAGES
-
-    def wait_for_the_last(self) -> None:
-        """Wait for the messages under way. DeliveryError: some were lost."""
-        if not wait_until(lambda: not self._missing_now(), _LAST_MESSAGES):
-            samples = plural(self._counts.samples, "odometry message")
-            raise DeliveryError(f"{self._missing_now():,} of {samples} of the node did not reach their subscriber")
-
-    def _missing_now(self) -> int:
-        """Messages that were published, or are about to be, and have not come."""
-        return self._counts.samples - min(len(each.stamps) for each in self._collectors)
-
-
 def demonstrate(
     config: LiveConfig,
     recording: Recording,
@@ -135,85 +79,82 @@ def demonstrate(
     DeliveryError: samples, or the odometry of some, were lost, or another sender wrote to the robot. Other errors as
     from LiveNode and Player.
     """
-    stop = stop or threading.Event()
     robot = robot_called(config, config.replay.robot)
     load_effects(config)
-    read_calibration(robot.calibration).check_wheels(
-        recording.dataset.robot, f"the recording {recording.dataset.name} for robot {robot.name!r}"
-    )
+    what = f"the recording {recording.dataset.name} for robot {robot.name!r}"
+    read_calibration(robot.calibration).check_wheels(recording.dataset.robot, what)
     drive = concatenate_recording(recording, pause=config.replay.pause, split=config.replay.split)
-    with LiveNode(config, remember=False) as node:
+    received: dict[str, _Received] = {"odom": []}
+    if config.fusion_of(robot) is not None:
+        received[_FUSED] = []
+    with LiveNode(config, remember=False) as node, ExitStack() as closing:
         tracker = node.trackers[robot.name]
-        guarded = config.zenoh.users_file is not None and config.zenoh.user is None
-        session = node.session if guarded else open_session(client_session(config.zenoh), "replay")
-        try:
-            odometry = _Collector(session, robot.name, "odom", config)
-            fused = None
-            if config.fusion_of(robot) is not None:
-                fused = _Collector(session, robot.name, "odometry/filtered", config)
-            player = Player(
-                GraphNode(session, node.keys, "replay"),
-                robot.name,
-                drive,
-                config.replay,
-                names=joints_of(tracker.calibration.robot, robot.wheels).names,
-                noise=tracker.calibration.noise,
-            )
+        for topic, messages in received.items():
 
-            def with_health(event: Progress) -> None:
-                health = node.health(robot.name)
-                fused = plural(health.counts["poses"], "pose")
-                watch(replace(event, note=f"{event.note}, {health.rate_hz:.0f} samples/s, {fused} fused"))
+            def take(message: Odometry, messages: _Received = messages) -> None:
+                messages.append((message.stamp, message.pose))
 
-            results = _Results(tracker, [each for each in (odometry, fused) if each is not None])
-            report = player.play(stop, with_health, results.behind, seconds)
-            results.wait_for_the_last()
+            # In the node's own session, in which a full queue delays the node and loses nothing.
+            at: dict[str, Any] = {"session": node.session, "profile": config.profile, "domain": config.domain}
+            closing.enter_context(subscribe(robot.name, topic=topic, callback=take, lossless=True, **at))
+        session = node.session
+        if config.zenoh.users_file is None or config.zenoh.user is not None:
+            session = open_session(client_session(config.zenoh), "replay")
+            closing.callback(close_session, session)
+        calibration = tracker.calibration
+        names, noise = joints_of(calibration.robot, robot.wheels).names, calibration.noise
+        player = Player(GraphNode(session, node.keys, "replay"), robot.name, drive, config.replay, names, noise)
+
+        def with_health(event: Progress) -> None:
             health = node.health(robot.name)
-            # Samples that the replay did not send are another sender's.
-            others = health.counts["samples"] - report.sent["joint_states"]
-            if others > 0 or len(tracker.flows) > 1:
-                raise DeliveryError(
-                    f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the "
-                    "recording; end the other one, or listen at another port"
-                )
-            for collector in (odometry, fused):
-                if collector is not None:
-                    collector.close()
-        finally:
-            if not guarded:
-                close_session(session)
-        return _evaluate(drive, recording, tracker.calibration, report, odometry, fused, health)
+            fused = plural(health.counts["poses"], "pose")
+            watch(replace(event, note=f"{event.note}, {health.rate_hz:.0f} samples/s, {fused} fused"))
 
+        def missing() -> int:
+            return tracker.counts.samples - min(map(len, received.values()))
 
-def _evaluate(
-    drive: ConcatenatedDrive,
-    recording: Recording,
-    calibration: Calibration,
-    report: PlayReport,
-    odometry: _Collector,
-    fused: _Collector | None,
-    health: Health,
-) -> Demonstration:
-    """Compare the node's output with the batch odometry, and all odometry with the truth or the reference."""
+        report = player.play(stop, with_health, seconds=seconds)
+        if not wait_until(lambda: not missing(), _LAST_MESSAGES):
+            samples = plural(tracker.counts.samples, "odometry message")
+            raise DeliveryError(f"{missing():,} of {samples} of the node did not reach their subscriber")
+        health = node.health(robot.name)
+        # Samples that the replay did not send are another sender's.
+        if health.counts["samples"] > report.sent["joint_states"] or len(tracker.flows) > 1:
+            why = f"another sender wrote to robot {robot.name!r} meanwhile: its odometry is not that of the recording"
+            raise DeliveryError(f"{why}; end the other one, or listen at another port")
+    # Compare the node's output with the batch odometry, and all odometry with the truth or the reference.
     drive = replace(drive, robot=calibration.robot)  # whose drive signals the node took
     times = drive.wheel_times
     batch = calibration.model.poses([drive.log(session=calibration.session)])[0]
     design = OdometryModel.of_design(calibration.robot, calibration.integration).poses([drive.log()])[0]
-    origin = odometry.stamps[0] if odometry.stamps else 0
-    rows = _rows(odometry.stamps, origin, times)
-    # odom begins at the origin, the drive at its start pose; the drive's poses are of the tracked point
-    published = _tracked(calibration, odometry.poses)
-    if odometry.stamps:
+    origin = received["odom"][0][0] if received["odom"] else 0
+    mount = calibration.robot.mount
+
+    def aligned(messages: _Received) -> tuple[NDArray[np.intp], Array]:
+        """Index of the wheel sample of each message, and its pose (K, 3), of the tracked point, headings continuous."""
+        seconds = np.array([stamp - origin for stamp, _ in messages], dtype=np.int64) / 1e9
+        poses = np.array([pose for _, pose in messages]).reshape(-1, 3)
+        poses[:, 2] = np.unwrap(poses[:, 2])  # messages hold quaternions
+        rows = np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
+        return rows, poses if mount is None else RobotCentre(mount).tracked(poses)
+
+    rows, published = aligned(received["odom"])
+    if len(rows):  # odom begins at the origin, the drive at its start pose
         published = moved_to(drive.start_poses[0], published)
     if recording.truth is not None:
-        against, reference = "the simulated truth", concatenated_truth(drive, recording)
-        chosen = rows
+        against, reference, chosen = "the simulated truth", concatenated_truth(drive, recording), rows
     else:
-        against, reference = (
-            "the reference poses of the recording",
-            interpolated(times, drive.slam_times, drive.slam_poses),
-        )
+        against = "the reference poses of the recording"
+        reference = interpolated(times, drive.slam_times, drive.slam_poses)
         chosen = rows[(times[rows] >= drive.slam_times[0]) & (times[rows] <= drive.slam_times[-1])]
+    fused = None
+    if _FUSED in received:
+        # From 1 s after the first SLAM pose on: before, the robot's pose in the map is not known.
+        fused_rows, poses = aligned(received[_FUSED])
+        known = np.isin(fused_rows, chosen) & (times[fused_rows] > drive.slam_times[0] + 1.0)
+        poses, expected = poses[known], reference[fused_rows[known]]
+        poses[:, 2] -= math.tau * np.round((poses[:1, 2] - expected[:1, 2]) / math.tau)
+        fused = _deviation(poses, expected)
     return Demonstration(
         robot=health.robot,
         calibration=calibration.name,
@@ -222,35 +163,10 @@ def _evaluate(
         against=against,
         theoretical=_deviation(design[chosen], reference[chosen]),
         calibrated=_deviation(batch[chosen], reference[chosen]),
-        fused=None
-        if fused is None
-        else _fused_deviation(fused.stamps, _tracked(calibration, fused.poses), origin, drive, reference, chosen),
+        fused=fused,
         batch_difference=float(np.abs(published - batch[rows]).max()) if len(rows) else math.nan,
         health=health,
     )
-
-
-def _rows(stamps: list[int], origin: int, times: Array) -> Array:
-    """Index of the wheel sample of each stamp."""
-    seconds = (np.array(stamps, dtype=np.int64) - origin) / 1e9
-    return np.clip(np.searchsorted(times, seconds - 1e-6), 0, len(times) - 1)
-
-
-def _tracked(calibration: Calibration, poses: Array) -> Array:
-    """Poses (K, 3) of the tracked point, from those of the robot's centre, which a node publishes."""
-    mount = calibration.robot.mount
-    return poses if mount is None else RobotCentre(mount).tracked(poses)
-
-
-def _fused_deviation(
-    stamps: list[int], poses: Array, origin: int, drive: ConcatenatedDrive, reference: Array, chosen: Array
-) -> Deviation:
-    """Deviation from 1 s after the first SLAM pose on: before, the robot's pose in the map is not known."""
-    rows = _rows(stamps, origin, drive.wheel_times)
-    known = np.isin(rows, chosen) & (drive.wheel_times[rows] > drive.slam_times[0] + 1.0)
-    poses, reference = poses[known], reference[rows[known]]
-    turns = np.round((poses[:1, 2] - reference[:1, 2]) / math.tau)
-    return _deviation(poses - [0.0, 0.0, 1.0] * (math.tau * turns[:, None]), reference)
 
 
 def _deviation(poses: Array, reference: Array) -> Deviation:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,6 @@ def load_recording(path: Path, dataset: str | None = None, watch: Reporter = no_
     return Recording(load_dataset(path))
 
 
-FULL_TURN = 2 * np.pi
 LONGEST_PAUSE = 3600.0  # s between two runs; chosen
 _MOST_RESTING = 10_000_000  # wheel samples of all pauses together: a day at 100 Hz; chosen
 _SAME_TIME = 1e-9  # s, the resolution of stamps: times that differ by less are equal
@@ -98,28 +97,16 @@ class ConcatenatedDrive:
     start_times: Array
     steering: Array | None = None
 
-    @property
-    def duration(self) -> float:
-        """Time from the first sample to the last, s."""
-        return float(max(self.wheel_times[-1], self.slam_times[-1]))
-
     def log(self, stamps: Sequence[float] | Array | None = None, session: str | None = None) -> WheelLog:
         """The drive's wheel samples for the batch odometry, with poses at ``stamps`` (s; default: every sample).
 
         session: name of the session, which starts with the drive.
         """
         wanted = self.wheel_times if stamps is None else np.asarray(stamps, dtype=float)
-        return WheelLog(
-            self.wheel_times[1:],
-            self.rates[1:],
-            self.start_poses[0],
-            wanted,
-            self.angles[1:],
-            0.0,
-            session or "",
-            None if self.steering is None else self.steering[1:],
-            None if self.steering is None else self.robot.drive,
-        )
+        steering = None if self.steering is None else self.steering[1:]
+        drive = None if steering is None else self.robot.drive
+        times, rates, angles, start = self.wheel_times[1:], self.rates[1:], self.angles[1:], self.start_poses[0]
+        return WheelLog(times, rates, start, wanted, angles, 0.0, session or "", steering, drive)
 
 
 def concatenate_runs(
@@ -139,44 +126,62 @@ def concatenate_runs(
     moves = np.array([relative(run.start, run.final_pose) for run in runs])
     starts = _composed(runs[0].start, moves)
     if start_poses is not None:
+        starts = np.array(start_poses, dtype=float)
+        if starts.shape != moves.shape or not np.isfinite(starts).all():
+            shapes = f"have shape {starts.shape}, expected {moves.shape}, finite"
+            raise DataError(f"data set {dataset.name}: start poses {shapes}")
         # Multiples of 2 pi are added so that headings are continuous from run to run.
-        poses = np.asarray(start_poses, dtype=float)
-        if poses.shape != moves.shape or not np.isfinite(poses).all():
-            raise DataError(
-                f"data set {dataset.name}: start poses have shape {poses.shape}, expected {moves.shape}, finite"
-            )
-        leaps = np.diff(poses[:, 2]) - moves[:-1, 2]
-        turns = np.concatenate([[0.0], np.cumsum(np.round(leaps / FULL_TURN))])
-        starts = np.column_stack([poses[:, :2], poses[:, 2] - FULL_TURN * turns])
+        errors = starts[:, 2] - np.append(0.0, np.cumsum(moves[:-1, 2]))
+        starts[:, 2] += np.unwrap(errors) - errors
     # Samples of a standstill do not come oftener than others, whatever the data set's nominal period is.
     periods = np.concatenate([np.diff(run.times, prepend=0.0) for run in runs])
     period = max(dataset.sample_period, 0.5 * float(np.median(periods)))
-    resting = [*(_rest_samples(run, pause, period) for run in runs[:-1]), 0]
+    # Number of samples at standstill after a run: up to its last reference pose if that is later, and the pause.
+    missing = [np.ceil((run.pose_times[-1] - run.times[-1] - _SAME_TIME) / period) for run in runs[:-1]]
+    resting = [*(max(0, int(samples)) + round(pause / period) for samples in missing), 0]
     if sum(resting) > _MOST_RESTING:
-        raise ConfigError(
-            f"pause: with {pause:g} s the robot stands still for {sum(resting)} samples, more than {_MOST_RESTING}; "
-            "give a shorter one, and check the times of the last poses"
-        )
-    legs = [_with_rest(run, rest, period) for run, rest in zip(runs, resting, strict=True)]
-    begins = np.concatenate([[0.0], np.cumsum([leg.times[-1] for leg in legs[:-1]])])
-    measured = [run.pose_times > 0 for run in runs]
-    measured[0] = np.ones(len(runs[0].pose_times), dtype=bool)
+        standstill = f"with {pause:g} s the robot stands still for {sum(resting)} samples, more than {_MOST_RESTING}"
+        raise ConfigError(f"pause: {standstill}; give a shorter one, and check the times of the last poses")
+    # Rows of the drive's arrays, run by run; those of the wheels begin with the baseline.
+    begins, times, rates = [0.0], [np.zeros(1)], [np.zeros((1, len(dataset.robot.wheel_names)))]
+    angles, steering, slam_times, slam_poses, covariances = (list[Array]() for _ in range(5))
+    for number, (run, start, rest) in enumerate(zip(runs, starts, resting, strict=True)):
+        begin, still, rested = begins[-1], ((0, rest), (0, 0)), number > 0 and resting[number - 1] > 0
+        times.append(begin + np.append(run.times, run.times[-1] + period * np.arange(1, rest + 1)))
+        begins.append(float(times[-1][-1]))
+        rates.append(np.pad(run.rates, still))
+        turned = run.angles
+        if turned is None:
+            turned = np.cumsum(run.rates * np.diff(run.times, prepend=0.0)[:, None], axis=0)
+        before = turned[0] - run.rates[0] * run.times[0]
+        angles = angles or [before[None]]
+        angles.append(np.pad(turned, still, mode="edge") + (angles[-1][-1] - before))
+        if run.steering is not None:
+            steering = steering or [run.steering[:1]]
+            if rested:
+                steering[-1][-1] = run.steering[0]
+            steering.append(np.pad(run.steering, still, mode="edge"))
+        measured = slice(min(number, 1), None)  # the start pose of a later run is set by the drive
+        slam_times.append(begin + run.pose_times[measured])
+        slam_poses.append(moved_to(start, run.poses)[measured])
+        if run.pose_covariances is not None:
+            turn = rotation(start[2] - run.start[2])
+            covariances.append(turn @ run.pose_covariances[measured] @ turn.T)
+    numbers = np.arange(len(runs))
     return ConcatenatedDrive(
         robot=dataset.robot,
         ids=tuple(run.id for run in runs),
-        wheel_times=np.concatenate([[0.0], *(begin + leg.times for begin, leg in zip(begins, legs, strict=True))]),
-        angles=_continuous_angles(legs),
-        rates=np.concatenate([np.zeros((1, len(dataset.robot.wheel_names))), *(leg.rates for leg in legs)]),
-        run=np.repeat(np.arange(len(legs)), [1 + len(legs[0].times), *(len(leg.times) for leg in legs[1:])]),
-        slam_times=np.concatenate([b + run.pose_times[m] for b, run, m in zip(begins, runs, measured, strict=True)]),
-        slam_poses=np.concatenate(
-            [moved_to(start, run.poses)[m] for start, run, m in zip(starts, runs, measured, strict=True)]
-        ),
-        slam_covariances=_covariances(runs, starts, measured),
-        slam_run=np.repeat(np.arange(len(runs)), [np.count_nonzero(m) for m in measured]),
+        wheel_times=np.concatenate(times),
+        angles=np.concatenate(angles),
+        rates=np.concatenate(rates),
+        run=np.append(0, np.repeat(numbers, [len(part) for part in times[1:]])),
+        slam_times=np.concatenate(slam_times),
+        slam_poses=np.concatenate(slam_poses),
+        slam_covariances=np.concatenate(covariances) if len(covariances) == len(runs) else None,
+        slam_run=np.repeat(numbers, [len(part) for part in slam_times]),
         start_poses=starts,
-        start_times=begins,
-        steering=_steering(legs, resting),
+        start_times=np.array(begins[:-1]),
+        steering=np.unwrap(np.concatenate(steering), axis=0) if steering else None,
     )
 
 
@@ -191,8 +196,8 @@ def true_start_poses(recording: Recording, split: Split | None = None) -> Array:
 
     With them the errors of a drive's reference poses do not accumulate from run to run.
     """
-    truth, runs = _TruthOfRuns(recording), _ordered(recording.dataset, split)
-    moves = [relative(run.start, truth.poses(run, run.times[-1:])[0]) for run in runs]
+    runs = _ordered(recording.dataset, split)
+    moves = [relative(run.start, _true_poses(recording, run, run.times[-1:])[0]) for run in runs]
     return _composed(runs[0].start, np.array(moves))
 
 
@@ -202,18 +207,11 @@ def concatenated_truth(drive: ConcatenatedDrive, recording: Recording) -> Array:
     Continuous if the drive has true start poses; else it jumps between runs by the error of the reference. DataError
     without a truth.
     """
-    truth = _TruthOfRuns(recording)
-    known = {run.id: run for run in recording.dataset.trajectories}
-    bounds = np.searchsorted(drive.run, np.arange(1, len(drive.ids)))
     poses = []
-    for index, times in enumerate(np.split(drive.wheel_times, bounds)):
-        if drive.ids[index] not in known:
-            raise DataError(
-                f"run {drive.ids[index]} is not in data set {recording.dataset.name}; take the drive's own recording"
-            )
-        run = _trimmed(known[drive.ids[index]])
-        driven = truth.poses(run, np.append(0.0, times - drive.start_times[index]))
-        poses.append(moved_to(drive.start_poses[index], driven)[1:])
+    for number, name in enumerate(drive.ids):
+        stamps = drive.wheel_times[drive.run == number] - drive.start_times[number]
+        driven = _true_poses(recording, _trimmed(recording.dataset[name]), np.append(0.0, stamps))
+        poses.append(moved_to(drive.start_poses[number], driven)[1:])
     return np.concatenate(poses)
 
 
@@ -224,22 +222,16 @@ def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
         raise DataError(f"data set {dataset.name}: no run in split {split!r}; choose another split, or none")
     sessions: dict[str | None, list[Trajectory]] = {}
     for run in chosen:
+        if not run.has_poses:
+            reason = "a single reference pose; it cannot be concatenated"
+            if run.references is not None:
+                reason = "distances, turns and the like, and no poses; replay runs with poses, or others of --split"
+            raise DataError(f"data set {dataset.name}: run {run.id} has {reason}")
         sessions.setdefault(run.session, []).append(run)
     for runs in sessions.values():
         if all(run.started_at is not None for run in runs):
             runs.sort(key=lambda run: run.started_at or 0.0)
-    ordered = [run for runs in sessions.values() for run in runs]
-    for run in ordered:
-        if not run.has_poses and run.references is not None:
-            raise DataError(
-                f"data set {dataset.name}: run {run.id} has distances, turns and the like and no reference poses, so "
-                "that nothing says where the next run begins; replay runs with poses, or others of --split"
-            )
-        if len(run.pose_times) < 2:
-            raise DataError(
-                f"data set {dataset.name}: run {run.id} has a single reference pose; it cannot be concatenated"
-            )
-    return [_trimmed(run) for run in ordered]
+    return [_trimmed(run) for runs in sessions.values() for run in runs]
 
 
 def _trimmed(run: Trajectory) -> Trajectory:
@@ -248,72 +240,15 @@ def _trimmed(run: Trajectory) -> Trajectory:
     if run.times[-1] <= end + _SAME_TIME:
         return run
     last = int(np.searchsorted(run.times, end - _SAME_TIME))  # the sample that reaches the end or passes it
-    times = np.append(run.times[:last], min(run.times[last], end))
-    kept = slice(0, last + 1)
-    angles = None
-    if run.angles is not None:
-        angles = run.angles[kept].copy()
-        angles[last] -= run.rates[last] * (run.times[last] - times[last])
-    targets, steering = (None if array is None else array[kept] for array in (run.targets, run.steering))
-    cut = replace(run, times=times, rates=run.rates[kept], angles=angles, targets=targets, steering=steering)
-    return replace(cut, odometry=None)
-
-
-def _rest_samples(run: Trajectory, pause: float, period: float) -> int:
-    """Number of samples at standstill after a run: up to its last reference pose if that is later, and the pause."""
-    missing = (run.pose_times[-1] - run.times[-1] - _SAME_TIME) / period
-    return max(0, int(np.ceil(missing))) + round(pause / period)
-
-
-def _with_rest(run: Trajectory, rest: int, period: float) -> Trajectory:
-    """A run with samples of standstill after it, and with its rates integrated where no angles were recorded."""
-    still, angles = np.zeros((rest, run.rates.shape[1])), run.angles
-    if angles is None:
-        angles = np.cumsum(run.rates * np.diff(run.times, prepend=0.0)[:, None], axis=0)
-    return replace(
-        run,
-        times=np.append(run.times, run.times[-1] + period * np.arange(1, rest + 1)),
-        rates=np.vstack([run.rates, still]),
-        angles=np.vstack([angles, angles[-1] + still]),
-        targets=None,
-        steering=None if run.steering is None else np.vstack([run.steering, *[run.steering[-1:]] * rest]),
-    )
-
-
-def _steering(legs: Sequence[Trajectory], resting: Sequence[int]) -> Array | None:
-    """Steering angles (n, S) at the baseline and at all samples, made continuous over whole turns."""
-    parts: list[Array] = []
-    for leg, rest in zip(legs, (0, *resting), strict=False):
-        if leg.steering is None:
-            return None
-        if rest:
-            parts[-1][-1] = leg.steering[0]
-        parts += [leg.steering.copy()] if parts else [leg.steering[:1], leg.steering.copy()]
-    angles: Array = np.unwrap(np.concatenate(parts), axis=0)
-    return angles
-
-
-def _continuous_angles(legs: Sequence[Trajectory]) -> Array:
-    """Wheel angles (n, N) at the baseline and at all samples, made continuous from run to run."""
-    parts: list[Array] = []
-    for leg in legs:
-        assert leg.angles is not None  # recorded or integrated
-        before = leg.angles[0] - leg.rates[0] * leg.times[0]
-        if not parts:
-            parts.append(before[None])
-        parts.append(leg.angles + (parts[-1][-1] - before))
-    return np.concatenate(parts)
-
-
-def _covariances(runs: Sequence[Trajectory], starts: Array, measured: Sequence[NDArray[np.bool_]]) -> Array | None:
-    """Covariances of the reference, rotated with their runs; None unless all runs have them."""
-    parts = []
-    for run, start, chosen in zip(runs, starts, measured, strict=True):
-        if run.pose_covariances is None:
-            return None
-        turn = rotation(start[2] - run.start[2])
-        parts.append(turn @ run.pose_covariances[chosen] @ turn.T)
-    return np.concatenate(parts)
+    rows: dict[str, Any] = {}
+    for name in ("times", "rates", "angles", "targets", "steering"):
+        array = getattr(run, name)
+        rows[name] = None if array is None else array[: last + 1].copy()
+    excess = max(run.times[last] - end, 0.0)
+    rows["times"][last] -= excess
+    if rows["angles"] is not None:
+        rows["angles"][last] -= run.rates[last] * excess
+    return replace(run, **rows, odometry=None)
 
 
 def _composed(first: Array, moves: Array) -> Array:
@@ -321,35 +256,22 @@ def _composed(first: Array, moves: Array) -> Array:
     return np.array(list(accumulate(moves[:-1], compose, initial=first)))
 
 
-class _TruthOfRuns:
-    """The true motion of a simulated robot. DataError: the recording has no truth."""
-
-    def __init__(self, recording: Recording) -> None:
-        if recording.truth is None:
-            raise DataError(
-                f"data set {recording.dataset.name}: it has no truth; name a comparison's config, which simulates it"
-            )
-        self._paths = recording.paths
-        self._robot = recording.truth.true_robot()
-        self._variation = recording.truth.variation
-
-    def poses(self, run: Trajectory, stamps: Array) -> Array:
-        """True poses (K, 3) at stamps (K,), s since the run's start."""
-        if run.id in self._paths:
-            return moved_to(run.start, self._paths[run.id].at(np.append(0.0, stamps)))[1:]
-        if run.targets is None or run.angles is None:
-            raise DataError(f"run {run.id}: its set points are not recorded, so its truth is not known")
-        rates = self._robot.driven(run.times, run.targets)
-        angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
-        steering = true_steering(self._robot.model.robot, run, self._variation)
-        log = self._robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session, steering)
-        return self._robot.poses(log)
+def _true_poses(recording: Recording, run: Trajectory, stamps: Array) -> Array:
+    """True poses (K, 3) of a simulated robot at stamps (K,), s since a run's start. DataError without a truth."""
+    if recording.truth is None:
+        name = recording.dataset.name
+        raise DataError(f"data set {name}: it has no truth; name a comparison's config, which simulates it")
+    if run.id in recording.paths:
+        return moved_to(run.start, recording.paths[run.id].at(np.append(0.0, stamps)))[1:]
+    if run.targets is None or run.angles is None:
+        raise DataError(f"run {run.id}: its set points are not recorded, so its truth is not known")
+    robot = recording.truth.true_robot()
+    angles = run.angles[0] - run.rates[0] * run.times[0]  # before its first sample
+    steering = true_steering(robot.model.robot, run, recording.truth.variation)
+    rates = robot.driven(run.times, run.targets)
+    return robot.poses(robot.log(run.times, rates, run.start, stamps, angles, run.started_at, run.session, steering))
 
 
-WHEELS, SLAM = 0, 1  # indices in TOPICS_PLAYED
-TOPICS_PLAYED: Final = ("joint_states", "slam_pose")
-
-_SAME_ARRIVAL = 1e-6  # s; times that differ by less are equal
 _LATEST_ORIGIN = (2**31 - 10**8) * 10**9  # ns; ROS 2's stamps end at 2^31 s
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -408,54 +330,6 @@ class ReplayConfig(Model):
     wheels: WheelChannel = WheelChannel()
     slam: SlamChannel = SlamChannel()
     stamp_origin: int | None = Field(
-        None,
-        gt=0,
-        le=_LATEST_ORIGIN,
-        description="stamp of the recording's start, ns; default: the replay's start",
+        None, gt=0, le=_LATEST_ORIGIN, description="stamp of the recording's start, ns; default: the replay's start"
     )
     wait: NonNegative = Field(10.0, description="longest wait for a subscriber of the wheel samples, s; 0: do not wait")
-
-
-@dataclass(frozen=True, eq=False)
-class Schedule:
-    """All messages by time of arrival: arrivals (E,) s; topics (E,) in TOPICS_PLAYED; rows (E,) in the drive."""
-
-    arrivals: Array
-    topics: NDArray[np.int8]
-    rows: NDArray[np.intp]
-
-    def __len__(self) -> int:
-        return len(self.arrivals)
-
-
-def make_schedule(drive: ConcatenatedDrive, config: ReplayConfig) -> Schedule:
-    """The arrivals of a drive's messages. They depend on the seed only; each topic has its own random numbers."""
-    wheel_seed, slam_seed = np.random.SeedSequence(config.seed).spawn(2)
-    samples, sampled = _arrivals(drive.wheel_times, config.wheels, np.random.default_rng(wheel_seed))
-    # Poses that are at least a period apart, beginning with the first.
-    chosen, index = [], 0
-    while index < len(drive.slam_times):
-        chosen.append(index)
-        index = max(
-            index + 1,
-            int(np.searchsorted(drive.slam_times, drive.slam_times[index] + config.slam.period - _SAME_ARRIVAL)),
-        )
-    kept = np.array(chosen, dtype=np.intp)
-    poses, posed = _arrivals(drive.slam_times[kept], config.slam, np.random.default_rng(slam_seed))
-    arrivals = np.concatenate([sampled, posed])
-    topics = np.repeat(np.array([WHEELS, SLAM], dtype=np.int8), [len(samples), len(poses)])
-    rows = np.concatenate([samples, kept[poses]])
-    order = np.argsort(arrivals, kind="stable")
-    return Schedule(arrivals[order], topics[order], rows[order])
-
-
-def _arrivals(times: Array, channel: Channel, rng: np.random.Generator) -> tuple[NDArray[np.intp], Array]:
-    """Indices (E,) of the messages that arrive, some of them twice, and their times of arrival (E,)."""
-    chance, jitter = rng.random((2, len(times))), np.abs(rng.standard_normal((2, len(times))))
-    arrives = chance[0] >= channel.drop
-    twice = arrives & (chance[1] < channel.duplicate)
-    late = times + channel.delay + channel.jitter * jitter
-    indices = np.concatenate([np.flatnonzero(arrives), np.flatnonzero(twice)])
-    when = np.concatenate([late[0][arrives], late[1][twice]])
-    order = np.lexsort((indices, when))
-    return indices[order], when[order]

@@ -14,7 +14,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -62,9 +62,16 @@ class PoseMeasurement:
         return self.stamp if self.heading_stamp is None else min(self.stamp, self.heading_stamp)
 
 
+class Estimate(NamedTuple):
+    """Pose (3,) in the map, m, m, rad, the heading not wrapped, with its covariance (3, 3)."""
+
+    pose: Array
+    covariance: Array
+
+
 @dataclass(slots=True, eq=False)
 class Entry:
-    """One wheel sample: the motion up to it, and after it odometry's pose (3,), the filter's pose and covariance.
+    """One wheel sample: the motion up to it, and after it odometry's pose (3,) and the filter's estimate.
 
     measurements: poses whose time lies within the motion, in the order of time.
     """
@@ -72,8 +79,7 @@ class Entry:
     stamp: int
     motion: Motion
     odometry: Array
-    pose: Array
-    covariance: Array
+    estimate: Estimate
     measurements: tuple[PoseMeasurement, ...] = ()
 
 
@@ -144,30 +150,22 @@ class ReferenceCorrection:
         self._terms: list[tuple[ReferenceEffect, Values]] = [
             (term.effect, term.values) for term in model.reference_terms if isinstance(term.effect, ReferenceEffect)
         ]
-        self._start = start
-
-    def continued(self, model: OdometryModel) -> ReferenceCorrection:
-        """The correction by another model, from the same start on."""
-        return ReferenceCorrection(model, self._start)
-
-    def restart(self) -> None:
-        """The next pose is the first of another run."""
-        self._start = None
+        self.start = start
 
     def corrected(self, measurement: PoseMeasurement) -> PoseMeasurement:
         """The tracked point's true pose when its position was measured; its heading may be of another time."""
-        if self._start is None:
-            self._start = measurement
+        if self.start is None:
+            self.start = measurement
         if self._mount is not None:
             measurement = replace(measurement, mount=self._mount)
         if not self._terms:
             return measurement
-        stamps = np.array([(measurement.stamp - self._start.stamp) / _SECOND])
+        stamps = np.array([(measurement.stamp - self.start.stamp) / _SECOND])
         delays = [effect.delays(stamps, values) for effect, values in self._terms]
         of_position, of_heading = (sum(float(delay[kind][0]) for delay in delays) for kind in range(2))
         poses = measurement.pose[None]
         for effect, values in reversed(self._terms):
-            poses = effect.corrected(poses, self._start.pose, values)
+            poses = effect.corrected(poses, self.start.pose, values)
         return replace(
             measurement,
             stamp=measurement.stamp - round(_SECOND * of_position),
@@ -176,72 +174,27 @@ class ReferenceCorrection:
         )
 
 
-def turned(measurement: PoseMeasurement, before: Array, after: Array) -> PoseMeasurement:
-    """A pose whose heading was measured at another time, with its heading turned to the time of the position.
-
-    before, after: odometry's poses (3,) at the time of the heading and at that of the position.
-    """
-    pose: Array = measurement.pose + np.array([0.0, 0.0, after[2] - before[2]])
-    return replace(measurement, pose=pose, heading_stamp=None)
-
-
-def of_centre(measurement: PoseMeasurement) -> PoseMeasurement:
-    """The pose of the robot's centre, from that of a point of the robot."""
-    if measurement.mount is None:
-        return measurement
-    pose = RobotCentre(measurement.mount).pose(measurement.pose)
-    covariance = carried(measurement.covariance, (pose - measurement.pose)[:2])
-    return replace(measurement, pose=pose, covariance=covariance, mount=None)
-
-
 _TURN = 2 * math.pi
 _POSE = np.eye(3)  # measurement matrix: SLAM measures the pose itself
 
 
-class PoseFilter:
-    """Pose (3,) and covariance (3, 3); motions predict them, measured poses correct them."""
+def predict(estimate: Estimate, motion: Motion) -> Estimate:
+    """Extended Kalman filter: the estimate after a motion, P <- F P F^T + Q."""
+    before, after = estimate.pose, advance(estimate.pose, motion.moved, motion.integration)
+    (x, y, _), (to_x, to_y, _) = before.tolist(), after.tolist()
+    position, heading = motion.position_variance, motion.heading_variance
+    # F, derivative of the pose after the motion by the pose before; Q, noise of the motion
+    derivative = np.array([[1.0, 0.0, y - to_y], [0.0, 1.0, to_x - x], [0.0, 0.0, 1.0]])
+    noise = np.array([[position, 0.0, 0.0], [0.0, position, 0.0], [0.0, 0.0, heading]])
+    return Estimate(after, derivative.dot(estimate.covariance).dot(derivative.T) + noise)
 
-    def __init__(self, pose: Array, covariance: Array) -> None:
-        self._filter: Any = ExtendedKalmanFilter(dim_x=3, dim_z=3)
-        self._filter.predict_x = self._predict_pose
-        self._filter.Q = np.zeros((3, 3))
-        self.set(pose, covariance)
 
-    @property
-    def pose(self) -> Array:
-        """(3,): m, m, rad; the heading is not wrapped."""
-        return self._filter.x
-
-    @property
-    def covariance(self) -> Array:
-        return self._filter.P
-
-    def set(self, pose: Array, covariance: Array) -> None:
-        """Replace pose and covariance."""
-        self._filter.x = np.array(pose, dtype=float)
-        self._filter.P = np.array(covariance, dtype=float)
-
-    def predict(self, motion: Motion) -> None:
-        """Carry pose and covariance along a motion."""
-        self._filter.predict(motion)
-
-    def normalised_innovation(self, pose: Array, covariance: Array) -> float:
-        """Normalised innovation squared of a measured pose: chi-square with 3 degrees of freedom in theory."""
-        innovation = innovation_of(pose, self.pose)
-        return float(innovation @ np.linalg.solve(self.covariance + covariance, innovation))
-
-    def correct(self, pose: Array, covariance: Array) -> None:
-        """Correct pose and covariance by a measured pose (3,) with its covariance (3, 3)."""
-        self._filter.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
-
-    def _predict_pose(self, motion: Motion) -> None:
-        """The motion model of odometry in filterpy's prediction: pose, its derivative F and noise Q."""
-        before, after = self.pose, advance(self.pose, motion.moved, motion.integration)
-        self._filter.x = after
-        self._filter.F[0, 2] = before[1] - after[1]
-        self._filter.F[1, 2] = after[0] - before[0]
-        self._filter.Q[0, 0] = self._filter.Q[1, 1] = motion.position_variance
-        self._filter.Q[2, 2] = motion.heading_variance
+def correct(estimate: Estimate, pose: Array, covariance: Array) -> Estimate:
+    """Extended Kalman filter: the estimate corrected by a measured pose (3,) with its covariance (3, 3)."""
+    ekf: Any = ExtendedKalmanFilter(dim_x=3, dim_z=3)
+    ekf.x, ekf.P = estimate
+    ekf.update(pose, lambda _: _POSE, lambda x: x, R=covariance, residual=innovation_of)
+    return Estimate(ekf.x, ekf.P)
 
 
 def innovation_of(measured: Array, expected: Array) -> Array:
@@ -251,51 +204,17 @@ def innovation_of(measured: Array, expected: Array) -> Array:
     return difference
 
 
-# Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
-_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])
-
-
-class Rejections:
-    """The latest rejected poses, with odometry's poses at their times.
-
-    enough: number of poses that have to agree. limit: of the squared Mahalanobis distance of two poses that agree.
-    in_a_row: poses rejected since one was fused.
-    """
-
-    def __init__(self, enough: int, limit: float) -> None:
-        self._enough = enough
-        self._limit = limit
-        self._poses: deque[tuple[PoseMeasurement, Array]] = deque(maxlen=enough)
-        self.in_a_row = 0
-
-    def clear(self) -> None:
-        """Forget them: a pose was fused, or the map's frame or the clock has changed."""
-        self._poses.clear()
-        self.in_a_row = 0
-
-    def known(self, stamp: int) -> bool:
-        """True if a pose of this time was rejected already."""
-        return any(measurement.stamp == stamp for measurement, _ in self._poses)
-
-    def add(self, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """Add a rejected pose; True if enough agree on where the robot is. odometry (3,): pose in odom at its time."""
-        self.in_a_row += 1
-        self._poses.append((measurement, odometry))
-        return len(self._poses) == self._enough and all(
-            self._agrees(*each, measurement, odometry) for each in self._poses
-        )
-
-    def _agrees(self, earlier: PoseMeasurement, before: Array, measurement: PoseMeasurement, odometry: Array) -> bool:
-        """True if the earlier pose, moved on by odometry from ``before``, is the later one."""
-        carried = compose(earlier.pose, relative(before, odometry))
-        innovation = innovation_of(measurement.pose, carried)
-        spread = measurement.covariance + earlier.covariance + _DRIFT
-        return float(innovation @ np.linalg.solve(spread, innovation)) <= self._limit
+def squared_distance(pose: Array, expected: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of two poses whose difference has a covariance: in theory chi2 with 3 degrees."""
+    innovation = innovation_of(pose, expected)
+    return float(innovation @ np.linalg.solve(covariance, innovation))
 
 
 _NOWHERE = np.diag([100.0**2, 100.0**2, math.pi**2])  # m, rad: covariance before the robot is located; chosen
 _WAITING = 16  # poses that may wait for the wheel samples of their time; chosen
 _EVER = -(2**63)  # ns, before every stamp
+# Covariance of odometry's error from one rejected pose to another, m, rad; chosen.
+_DRIFT = np.diag([0.1**2, 0.1**2, 0.1**2])
 
 Outcome = Literal["fused", "located", "reacquired", "rejected", "too late", "ahead", "waiting", "duplicate"]
 
@@ -322,47 +241,25 @@ class FusionSettings(Model):
 class Fusion:
     """Pose of one robot in the map, by a Kalman filter over its timeline.
 
-    located: True once a pose or an order has said where the robot is. outcome: of the pose that was taken last.
-    fused_at: arrival of the last pose that was fused, s, monotonic; None since a reset.
+    estimate: now; ``predict`` brings it to the next sample. located: True once a pose or an order has said where the
+    robot is. outcome: of the pose that was taken last. fused_at: arrival of the last pose that was fused, s, monotonic;
+    None since a reset. rejected_in_a_row: poses that the gate rejected since one was fused.
     """
 
     def __init__(self, settings: FusionSettings, timeline: Timeline, counts: Counts) -> None:
         self.settings = settings
         self._timeline = timeline
         self._counts = counts
-        self._filter = PoseFilter(np.zeros(3), _NOWHERE)
+        self.estimate = Estimate(np.zeros(3), _NOWHERE)
         self._limit = 2.0 * float(gammaincinv(3 / 2, settings.gate))  # quantile of chi2 with 3 degrees of freedom
-        self._rejections = Rejections(settings.reacquire_after, self._limit)
+        # The latest rejected poses, with odometry's poses (3,) at their times; enough that agree are believed
+        self._rejected: deque[tuple[PoseMeasurement, Array]] = deque(maxlen=settings.reacquire_after)
+        self.rejected_in_a_row = 0
         self._waiting: deque[PoseMeasurement] = deque()
         self._since = _EVER  # ns; poses measured before are too late, as the pose was set then
         self.located = False
         self.outcome: Outcome | None = None
         self.fused_at: float | None = None
-
-    @property
-    def pose(self) -> Array:
-        """Pose (3,) in the map, m, m, rad; the heading is not wrapped."""
-        return self._filter.pose
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (3, 3) of the pose."""
-        return self._filter.covariance
-
-    @property
-    def rejected_in_a_row(self) -> int:
-        """Poses that the gate rejected since one was fused."""
-        return self._rejections.in_a_row
-
-    def begin(self, pose: Array, covariance: Array | None) -> None:
-        """Set the pose before the first wheel sample; covariance None: the robot is not located."""
-        self.located = covariance is not None
-        self._filter.set(pose, _NOWHERE if covariance is None else covariance)
-
-    def predict(self, motion: Motion) -> tuple[Array, Array]:
-        """Pose and covariance after a motion, for the new entry of the timeline."""
-        self._filter.predict(motion)
-        return self._filter.pose, self._filter.covariance
 
     def take_waiting(self) -> None:
         """Fuse the poses that came before the wheel samples of their time, if these are there now."""
@@ -376,49 +273,34 @@ class Fusion:
         self.outcome = self._refused(measurement) or self._fused_or_rejected(self._at_one_time(measurement))
         if self.outcome in ("fused", "located", "reacquired"):
             self._counts.poses += 1
-            self._rejections.clear()
+            self._forget_rejected()
             self.fused_at = measurement.arrival
         return self.outcome
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose now; poses that were measured before are not fused any more."""
-        if not self._timeline.entries:
-            self.begin(pose, covariance)  # before the first wheel sample
-            return
-        self._since = self._timeline.newest + 1
-        self._waiting.clear()
-        self._rejections.clear()
-        self.located = True
-        self._filter.set(pose, covariance)
-        newest = self._timeline.entries[-1]
-        newest.pose, newest.covariance = self._filter.pose, self._filter.covariance
+        self.estimate, self.located = Estimate(pose, covariance), True
+        if self._timeline.entries:
+            self.restart(self._timeline.newest + 1)
+            self._timeline.entries[-1].estimate = self.estimate
 
     def reset(self) -> None:
         """Forget where the robot is; the next pose of SLAM locates it."""
-        if not self._timeline.entries:
-            self.begin(np.zeros(3), None)
-            return
-        self.set_pose(self.pose, _NOWHERE)
+        self.set_pose(self.estimate.pose, _NOWHERE)
         self.located, self.outcome, self.fused_at = False, None, None
 
-    def restart(self) -> None:
-        """Forget the poses that wait or were rejected: the clock jumped, and their stamps have no meaning."""
+    def restart(self, since: int = _EVER) -> None:
+        """Forget the poses that wait or were rejected, and take none that was measured before a time, ns."""
         self._waiting.clear()
-        self._rejections.clear()
-        self._since = _EVER
+        self._forget_rejected()
+        self._since = since
 
-    def at(self, stamp: int) -> tuple[Array, Array] | None:
-        """Pose and covariance at a time (ns), between samples at constant twist; None outside the timeline."""
-        entries = self._timeline.entries
-        index = self._timeline.index(stamp)
+    def at(self, stamp: int) -> Estimate | None:
+        """The estimate at a time (ns), between samples at constant twist; None outside the timeline."""
+        entries, index = self._timeline.entries, self._timeline.index(stamp)
         if not entries or index == len(entries) or stamp < self._timeline.oldest:
             return None
-        if entries[index].stamp == stamp:
-            return entries[index].pose, entries[index].covariance
-        self._to(index, stamp)
-        estimate = self._filter.pose, self._filter.covariance
-        self._filter.set(entries[-1].pose, entries[-1].covariance)
-        return estimate
+        return entries[index].estimate if entries[index].stamp == stamp else self._within(index, stamp)
 
     def _refused(self, measurement: PoseMeasurement) -> Outcome | None:
         """Why a pose's stamp does not let it be fused now; None if it can be."""
@@ -433,93 +315,103 @@ class Fusion:
         if measurement.earliest < timeline.oldest or measurement.stamp < self._since:
             self._counts.pose_too_late += 1
             return "too late"
-        fused = timeline.entries[timeline.index(measurement.stamp)].measurements
-        if any(earlier.stamp == measurement.stamp for earlier in fused) or self._rejections.known(measurement.stamp):
+        taken = timeline.entries[timeline.index(measurement.stamp)].measurements
+        if measurement.stamp in {earlier.stamp for earlier in (*taken, *(pose for pose, _ in self._rejected))}:
             self._counts.pose_duplicates += 1
             return "duplicate"
         return None
 
     def _at_one_time(self, measurement: PoseMeasurement) -> PoseMeasurement:
         """The centre's pose, its heading turned by odometry to the time of its position if it is of another."""
-        if measurement.heading_stamp is None:
-            return of_centre(measurement)
-        before = self._timeline.odometry_at(measurement.heading_stamp)
-        after = self._timeline.odometry_at(measurement.stamp)
-        assert before is not None
-        assert after is not None
-        return of_centre(turned(measurement, before, after))
+        pose, covariance = measurement.pose, measurement.covariance
+        if measurement.heading_stamp is not None:
+            before = self._timeline.odometry_at(measurement.heading_stamp)
+            after = self._timeline.odometry_at(measurement.stamp)
+            assert before is not None
+            assert after is not None
+            pose = pose + np.array([0.0, 0.0, after[2] - before[2]])
+        if measurement.mount is not None:
+            tracked, pose = pose, RobotCentre(measurement.mount).pose(pose)
+            covariance = carried(covariance, (pose - tracked)[:2])
+        return replace(measurement, pose=pose, covariance=covariance, heading_stamp=None, mount=None)
 
     def _fused_or_rejected(self, measurement: PoseMeasurement) -> Outcome:
         """Fuse a pose whose time is within the timeline, or reject it by the gate."""
         index = self._timeline.index(measurement.stamp)
-        self._to(index, measurement.stamp)
         if not self.located:
             self._replace(index, measurement)
             self.located = True
             return "located"
-        if self._filter.normalised_innovation(measurement.pose, measurement.covariance) <= self._limit:
+        expected, covariance = self._within(index, measurement.stamp)
+        if squared_distance(measurement.pose, expected, covariance + measurement.covariance) <= self._limit:
             self._insert(index, measurement)
             return "fused"
         odometry = self._timeline.odometry_at(measurement.stamp)
         assert odometry is not None
-        if self._rejections.add(measurement, odometry):
+        self.rejected_in_a_row += 1
+        self._rejected.append((measurement, odometry))
+        # SLAM is believed if all of enough rejected poses, moved by odometry from their times on, are this one.
+        if len(self._rejected) == self._rejected.maxlen and all(
+            squared_distance(
+                measurement.pose,
+                compose(earlier.pose, relative(before, odometry)),
+                measurement.covariance + earlier.covariance + _DRIFT,
+            )
+            <= self._limit
+            for earlier, before in self._rejected
+        ):
             self._replace(index, measurement)
             self._counts.reacquired += 1
             return "reacquired"
         self._counts.pose_rejected += 1
-        self._filter.set(self._timeline.entries[-1].pose, self._timeline.entries[-1].covariance)
         return "rejected"
 
+    def _forget_rejected(self) -> None:
+        self._rejected.clear()
+        self.rejected_in_a_row = 0
+
     def _replace(self, index: int, measurement: PoseMeasurement) -> None:
-        """Set the filter to a pose; the other poses of its entry and of later ones are forgotten."""
+        """Set the estimate to a pose; the other poses of its entry and of later ones are forgotten."""
         for entry in self._timeline.entries[index:]:
             entry.measurements = ()
         self._insert(index, replace(measurement, absolute=True))
 
     def _insert(self, index: int, measurement: PoseMeasurement) -> None:
-        """Add a pose to its entry, and filter what came after it again."""
-        entry = self._timeline.entries[index]
+        """Add a pose to its entry, and filter it and what came after it again."""
+        entries = self._timeline.entries
+        entry = entries[index]
         entry.measurements = tuple(sorted((*entry.measurements, measurement), key=lambda one: one.stamp))
         if index == 0:  # the motion up to the oldest entry is not known: its pose is corrected as it is
-            self._apply(measurement)
-            entry.pose, entry.covariance = self._filter.pose, self._filter.covariance
-        # Filter all motions and poses from the entry on again.
-        first = max(index, 1)
-        entries = self._timeline.entries
-        self._filter.set(entries[first - 1].pose, entries[first - 1].covariance)
-        for number in range(first, len(entries)):
+            entry.estimate = _corrected(entry.estimate, measurement)
+        for number in range(max(index, 1), len(entries)):
             later = entries[number]
-            if later.measurements:
-                self._to(number, later.stamp)
-            else:
-                self._filter.predict(later.motion)
-            later.pose, later.covariance = self._filter.pose, self._filter.covariance
+            later.estimate = (
+                self._within(number, later.stamp)
+                if later.measurements
+                else predict(entries[number - 1].estimate, later.motion)
+            )
+        self.estimate = entries[-1].estimate
 
-    def _to(self, index: int, stamp: int) -> None:
-        """Bring the filter to a time (ns) within an entry's motion, with the entry's poses up to then."""
-        before, entry = self._timeline.entries[max(index - 1, 0)], self._timeline.entries[index]
-        self._filter.set(before.pose, before.covariance)
+    def _within(self, index: int, stamp: int) -> Estimate:
+        """The estimate at a time (ns) within an entry's motion, corrected by the entry's poses up to then."""
         if index == 0:
-            return
-        done = 0.0
-        for measurement in entry.measurements:
-            if measurement.stamp > stamp:
-                break
-            done = self._drive(entry, done, self._timeline.share(index, measurement.stamp))
-            self._apply(measurement)
-        self._drive(entry, done, self._timeline.share(index, stamp))
+            return self._timeline.entries[0].estimate
+        entry, estimate, done = self._timeline.entries[index], self._timeline.entries[index - 1].estimate, 0.0
+        poses = [measurement for measurement in entry.measurements if measurement.stamp <= stamp]
+        for measurement in (*poses, None):
+            share = self._timeline.share(index, stamp if measurement is None else measurement.stamp)
+            if share > done:
+                estimate, done = predict(estimate, entry.motion.part(share - done)), share
+            if measurement is not None:
+                estimate = _corrected(estimate, measurement)
+        return estimate
 
-    def _apply(self, measurement: PoseMeasurement) -> None:
-        if measurement.absolute:
-            self._filter.set(measurement.pose, measurement.covariance)
-        else:
-            self._filter.correct(measurement.pose, measurement.covariance)
 
-    def _drive(self, entry: Entry, done: float, to: float) -> float:
-        """Predict the part of an entry's motion between two shares (0 to 1); the second share."""
-        if to > done:
-            self._filter.predict(entry.motion.part(to - done))
-        return to
+def _corrected(estimate: Estimate, measurement: PoseMeasurement) -> Estimate:
+    """The estimate corrected by a pose, or replaced."""
+    if measurement.absolute:
+        return Estimate(measurement.pose, measurement.covariance)
+    return correct(estimate, measurement.pose, measurement.covariance)
 
 
 LOG = logging.getLogger("omnibench.live")
@@ -547,16 +439,16 @@ class PoseInput:
         except MessageError:
             self._counts.pose_undecodable += 1
             raise
-        try:
-            if message.frame not in ("", self._frame):
-                raise MessageError(f"the pose is in frame {message.frame!r}, not in {self._frame!r}")
-            if not np.isfinite(message.pose).all():
-                raise MessageError("the pose is not finite")
-            if np.abs(message.pose[:2]).max() > _FARTHEST:
-                raise MessageError(f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away")
-        except MessageError:
+        fault = ""
+        if message.frame not in ("", self._frame):
+            fault = f"the pose is in frame {message.frame!r}, not in {self._frame!r}"
+        elif not np.isfinite(message.pose).all():
+            fault = "the pose is not finite"
+        elif np.abs(message.pose[:2]).max() > _FARTHEST:
+            fault = f"the pose lies {np.abs(message.pose[:2]).max():.3g} m away"
+        if fault:
             self._counts.pose_invalid += 1
-            raise
+            raise MessageError(fault)
         by_arrival = self._settings.stamps == "arrival" and not replayed
         stamp = arrival_stamp(arrival) if by_arrival else message.stamp
         return PoseMeasurement(stamp, message.pose, self._covariance(message, calibration), arrival)
@@ -566,7 +458,13 @@ class PoseInput:
         if usable_covariances(message.covariance):
             return message.covariance
         sigma = self._settings.pose_sigma
-        covariance = _usual_covariance(calibration) if sigma is None else pose_covariance(*sigma)
+        if sigma is not None:
+            covariance = pose_covariance(*sigma)
+        else:  # the reference's white noise and bias together, as the calibration knows them
+            noise = calibration.noise or UNKNOWN_NOISE
+            position = noise.pose_position**2 + noise.bias_position**2 or UNKNOWN_NOISE.pose_position**2
+            heading = noise.pose_heading**2 + noise.bias_heading**2 or UNKNOWN_NOISE.pose_heading**2
+            covariance = np.diag([position, position, heading])
         if not self._counts.pose_default_covariance:
             LOG.warning(
                 "slam_pose: the covariance of a pose is unknown (variances %s); standard deviations of %.3g m and "
@@ -578,11 +476,3 @@ class PoseInput:
             )
         self._counts.pose_default_covariance += 1
         return covariance
-
-
-def _usual_covariance(calibration: Calibration) -> Array:
-    """Covariance (3, 3) of the reference's white noise and bias together, as the calibration knows them."""
-    noise = calibration.noise or UNKNOWN_NOISE
-    position = noise.pose_position**2 + noise.bias_position**2 or UNKNOWN_NOISE.pose_position**2
-    heading = noise.pose_heading**2 + noise.bias_heading**2 or UNKNOWN_NOISE.pose_heading**2
-    return np.diag([position, position, heading])

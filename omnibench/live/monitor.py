@@ -39,17 +39,6 @@ class OdometryStatus:
     undecodable: int
     missed: int = 0
 
-    @property
-    def position_sigma(self) -> float:
-        """Standard deviation of the position along an axis, m: the root of the mean of x's and y's variances."""
-        covariance = self.message.pose_covariance
-        return math.sqrt(max(float(covariance[0, 0] + covariance[1, 1]) / 2, 0.0))
-
-    @property
-    def heading_sigma(self) -> float:
-        """Standard deviation of the heading, rad."""
-        return math.sqrt(max(float(self.message.pose_covariance[2, 2]), 0.0))
-
 
 @dataclass(frozen=True)
 class HealthSummary:
@@ -73,34 +62,23 @@ class RobotStatus:
 
 def json_document(status: RobotStatus) -> Any:
     """A robot's state as a JSON document: SI units, infinity and NaN as null."""
-    content = {
-        "robot": status.robot,
-        "presence": status.presence,
-        "odom": _odometry_record(status.odom),
-        "filtered": _odometry_record(status.filtered),
-        "health": status.health,
-    }
-    return to_jsonable_python(content, inf_nan_mode="null")
-
-
-def _odometry_record(status: OdometryStatus | None) -> dict[str, Any] | None:
-    if status is None:
-        return None
-    message = status.message
-    return {
-        "stamp": message.seconds,
-        "frame": message.frame,
-        "pose": message.pose.tolist(),
-        "pose_covariance": message.pose_covariance.tolist(),
-        "position_sigma_m": status.position_sigma,
-        "heading_sigma_rad": status.heading_sigma,
-        "twist": message.twist.tolist(),
-        "rate_hz": status.rate,
-        "age_s": status.age,
-        "stamp_age_s": status.stamp_age,
-        "undecodable": status.undecodable,
-        "missed": status.missed,
-    }
+    content: dict[str, Any] = {"robot": status.robot, "presence": status.presence}
+    for name, stream in (("odom", status.odom), ("filtered", status.filtered)):
+        content[name] = stream and {
+            "stamp": stream.message.seconds,
+            "frame": stream.message.frame,
+            "pose": stream.message.pose.tolist(),
+            "pose_covariance": stream.message.pose_covariance.tolist(),
+            "position_sigma_m": stream.message.position_sigma,
+            "heading_sigma_rad": stream.message.heading_sigma,
+            "twist": stream.message.twist.tolist(),
+            "rate_hz": stream.rate,
+            "age_s": stream.age,
+            "stamp_age_s": stream.stamp_age,
+            "undecodable": stream.undecodable,
+            "missed": stream.missed,
+        }
+    return to_jsonable_python(content | {"health": status.health}, inf_nan_mode="null")
 
 
 _FUSED: Final = "odometry/filtered"
@@ -123,16 +101,13 @@ class RobotMonitor(Closing):
         self._name_part = 0 if keys.profile == "plain" else 1  # index of the robot's name in the parts of a key
         self._streams: dict[tuple[str, str], _Stream] = {}
         self._answers: dict[str, tuple[float, HealthSummary]] = {}
-        self._lock = Lock()
+        self._lock = Lock()  # held while these change
         self._queried_at = -math.inf
         self._presence = Presence(session)
-        names = robot or "*"
         self._subscribers: list[zenoh.Subscriber[None]] = []
-        for topic in ("odom", _FUSED):
-            take = direct(partial(self._take_odometry, topic))
-            self._subscribers.append(session.declare_subscriber(keys.expression(names, topic), take))
-        expression = keys.expression(names, "diagnostics")
-        self._subscribers.append(session.declare_subscriber(expression, direct(self._take_diagnostics)))
+        for topic in ("odom", _FUSED, "diagnostics"):
+            take = direct(self._take_diagnostics if topic == "diagnostics" else partial(self._take_odometry, topic))
+            self._subscribers.append(session.declare_subscriber(keys.expression(robot or "*", topic), take))
 
     @property
     def alive(self) -> tuple[str, ...]:
@@ -149,16 +124,16 @@ class RobotMonitor(Closing):
             self._session.get(key, take, target=everyone, timeout=_QUERY_PERIOD, source_info=source_of(self._session))
         alive, left = self._presence.alive, self._presence.left
         with self._lock:
-            streams, answers = dict(self._streams), dict(self._answers)
-        names = {name for name, _ in streams}
-        names.update(name for name in (*alive, *left) if self._robot in (None, name))
+            seen = {key: stream.status(now) for key, stream in self._streams.items()}
+            healths = {name: health for name, (at, health) in self._answers.items() if now - at < _HEALTH_LIFETIME}
+        names = {name for name, _ in seen} | {name for name in (*alive, *left) if self._robot in (None, name)}
         return [
             RobotStatus(
                 name,
                 "alive" if name in alive else "left" if name in left else "no token",
-                odom=streams[name, "odom"].status(now) if (name, "odom") in streams else None,
-                filtered=streams[name, _FUSED].status(now) if (name, _FUSED) in streams else None,
-                health=answers[name][1] if name in answers and now - answers[name][0] < _HEALTH_LIFETIME else None,
+                odom=seen.get((name, "odom")),
+                filtered=seen.get((name, _FUSED)),
+                health=healths.get(name),
             )
             for name in sorted(names)
         ]
@@ -180,10 +155,8 @@ class RobotMonitor(Closing):
 
     def _take_odometry(self, topic: str, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            key = self._name(sample), topic
             with self._lock:
-                stream = self._streams.setdefault(key, _Stream())
-            stream.take(sample)
+                self._streams.setdefault((self._name(sample), topic), _Stream()).take(sample)
 
     def _take_answer(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
@@ -197,70 +170,61 @@ class RobotMonitor(Closing):
             self._answers[str(reply.ok.key_expr).split("/")[1]] = time.monotonic(), health
 
     def _take_diagnostics(self, sample: zenoh.Sample) -> None:
-        name = self._name(sample)
-        with self._lock:
-            answer = self._answers.get(name)
+        """Take them for the health of a robot that answers no queries, whose answers hold more."""
         try:
             statuses = DIAGNOSTICS.decode(sample.payload.to_bytes()).statuses
         except MessageError:
             return
-        if not statuses or (answer is not None and time.monotonic() - answer[0] < _QUERY_PERIOD * 1.5):
-            return  # the robot answers queries, which hold more than diagnostics
-        worst = max(statuses, key=lambda status: status.level)
-        level = _LEVELS[worst.level] if worst.level < len(_LEVELS) else str(worst.level)
-        health = HealthSummary(level, worst.message, anomalies_among(dict(worst.values)))
+        name, now = self._name(sample), time.monotonic()
         with self._lock:
-            self._answers[name] = time.monotonic(), health
+            at, _ = self._answers.get(name, (-math.inf, None))
+            if statuses and now - at >= _QUERY_PERIOD * 1.5:
+                worst = max(statuses, key=lambda status: status.level)
+                level = _LEVELS[worst.level] if worst.level < len(_LEVELS) else str(worst.level)
+                self._answers[name] = now, HealthSummary(level, worst.message, anomalies_among(dict(worst.values)))
 
     def _name(self, sample: zenoh.Sample) -> str:
         return str(sample.key_expr).split("/")[self._name_part]
 
 
 class _Stream:
-    """The odometry messages of one robot's topic. ``take`` runs in Zenoh's thread, ``status`` in the reader's."""
+    """The odometry messages of one robot's topic, of which those that are read are decoded."""
 
     def __init__(self) -> None:
-        self._lock = Lock()
         self._numbers = MissedMessages()
-        self._count = 0
         self._undecodable = 0
-        self._arrived_at, self._arrived_at_by_clock = 0.0, 0.0
-        self._payload = b""
+        self._arrivals: deque[float] = deque()  # within _RATE_WINDOW, and one before
+        self._arrived_by_clock = 0.0
+        self._payload: bytes | None = None  # of a message that is not decoded yet
         self._message: Odometry | None = None
-        self._history: deque[tuple[float, int]] = deque()  # (time of arrival, messages until then) at each reading
 
     def take(self, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        with self._lock:
-            if self._numbers.take(sample.attachment) is None:
-                return
-            self._count += 1
-            self._arrived_at, self._arrived_at_by_clock = time.monotonic(), time.time()
-            self._payload = payload
+        if self._numbers.take(sample.attachment) is not None:
+            self._arrivals.append(time.monotonic())
+            self._forget(self._arrivals[-1])
+            self._arrived_by_clock, self._payload = time.time(), sample.payload.to_bytes()
 
     def status(self, now: float) -> OdometryStatus | None:
-        with self._lock:
-            count, payload = self._count, self._payload
-            arrived_at, arrived_at_by_clock = self._arrived_at, self._arrived_at_by_clock
-        if not self._history or self._history[-1][1] != count:
-            self._history.append((arrived_at, count))
+        if self._payload is not None:
             try:
-                self._message = ODOMETRY.decode(payload)
+                self._message = ODOMETRY.decode(self._payload)
             except MessageError:
                 self._undecodable += 1
-        while len(self._history) > 1 and now - self._history[1][0] > _RATE_WINDOW:
-            self._history.popleft()
+            self._payload = None
         if self._message is None:
             return None
-        lag = arrived_at_by_clock - self._message.seconds
-        age = max(now - arrived_at, 0.0)
-        stamp_age = age + lag if 0 <= lag <= _LARGEST_LAG else None
-        (first, count_before), (last, after) = self._history[0], self._history[-1]
+        self._forget(now)
+        first, last = self._arrivals[0], self._arrivals[-1]
+        lag, age = self._arrived_by_clock - self._message.seconds, max(now - last, 0.0)
         return OdometryStatus(
             self._message,
-            (after - count_before) / (last - first) if last > first else None,
-            age,
-            stamp_age,
-            self._undecodable,
-            self._numbers.count,
+            rate=(len(self._arrivals) - 1) / (last - first) if last > first else None,
+            age=age,
+            stamp_age=age + lag if 0 <= lag <= _LARGEST_LAG else None,
+            undecodable=self._undecodable,
+            missed=self._numbers.count,
         )
+
+    def _forget(self, now: float) -> None:
+        while len(self._arrivals) > 1 and now - self._arrivals[1] > _RATE_WINDOW:
+            self._arrivals.popleft()

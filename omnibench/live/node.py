@@ -16,10 +16,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import zenoh
 
@@ -27,15 +26,17 @@ from omnibench.environment import package_versions
 from omnibench.errors import one_line, require_type
 from omnibench.live.config import LiveConfig, RobotConfig, robot_called
 from omnibench.live.control import QueryServer
-from omnibench.live.health import Health, anomalies_in_words, diagnostic
+from omnibench.live.delivery import AcknowledgedFlows
+from omnibench.live.health import Counts, Health, anomalies_in_words, diagnostic
 from omnibench.live.network import close_session, open_session
 from omnibench.live.presence import Claim
-from omnibench.live.record import PORT, FoxgloveServer, Recorder, free_path
+from omnibench.live.record import Recorder, free_path
 from omnibench.live.state import RobotMemory
 from omnibench.live.stopping import Closing, RateLimiter, Stop
-from omnibench.live.topics import OUTPUTS, TOPICS, AcknowledgedFlows, GraphNode, KeySpace, Update
+from omnibench.live.topics import OUTPUTS, TOPICS, GraphNode, KeySpace, Update
 from omnibench.live.tracker import RobotTracker
-from omnibench.live.wire import Diagnostics, MissedMessages, flow_of
+from omnibench.live.viewers import PORT, FoxgloveServer, RerunView
+from omnibench.live.wire import Diagnostics, Flow, MissedMessages, flow_of
 from omnibench.registry import load_plugins
 from omnibench.robot.calibration import read_calibration
 from omnibench.words import plural
@@ -47,41 +48,50 @@ _SMOOTHING: Final = 0.1  # share of the latest turn in the mean; chosen
 
 
 class Intake(Closing):
-    """Runs the work that is handed to ``ready``, in turn, in a thread of its own until ``close``.
+    """Runs the turns of all robots: at once, in the caller's thread, or one after another in a thread of its own.
 
-    Zenoh's threads are then free to receive, and what waits can be seen. Where the thread is busy it pauses for a
-    moment between turns, so that messages come together: to hand the interpreter over for each one costs as much as
-    to take it.
+    To hand the interpreter to another thread costs as much as to take a message, so that Zenoh's threads take it
+    themselves. Where turns take most of the time, they run in the intake's thread until ``close``: Zenoh's threads are
+    then free to receive, what waits can be seen, and a pause between turns lets messages come together.
     """
 
     def __init__(self) -> None:
-        self._work: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+        self._turns: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._worked = self._spent = 0.0  # s in turns and in all, recent turns weighing most
+        self._last = time.perf_counter()
+        self._thread = threading.Thread(target=self._run_queued, name="intake", daemon=True)
         self._thread.start()
 
-    def ready(self, work: Callable[[], object]) -> None:
-        """Queue a piece of work, which must not raise. From any thread."""
-        self._work.put(work)
+    @property
+    def busy(self) -> bool:
+        """True if turns take most of the time."""
+        return self._worked > _BUSY * self._spent
+
+    def queue(self, turn: Callable[[], object]) -> None:
+        """Run a turn after those that are queued. From any thread."""
+        self._turns.put(turn)
+
+    def run(self, turn: Callable[[], object]) -> None:
+        """Run a turn now; an error is logged."""
+        began = time.perf_counter()
+        try:
+            turn()
+        except Exception as error:  # one robot must not silence the others
+            LOG.error("intake: %s: %s", type(error).__name__, one_line(str(error)))
+        now = time.perf_counter()
+        self._worked += _SMOOTHING * (now - began - self._worked)
+        self._spent += _SMOOTHING * (now - self._last - self._spent)
+        self._last = now
 
     def close(self) -> None:
         """Do what is queued, and no more."""
-        self._work.put(None)
+        self._turns.put(None)
         self._thread.join()
 
-    def _run(self) -> None:
-        worked = spent = 0.0  # s, recent turns weighing most
-        last = time.perf_counter()
-        while (work := self._work.get()) is not None:
-            began = time.perf_counter()
-            try:
-                work()
-            except Exception as error:  # one robot must not silence the others
-                LOG.error("intake: %s: %s", type(error).__name__, one_line(str(error)))
-            now = time.perf_counter()
-            worked += _SMOOTHING * (now - began - worked)
-            spent += _SMOOTHING * (now - last - spent)
-            last = now
-            if worked > _BUSY * spent:
+    def _run_queued(self) -> None:
+        while (turn := self._turns.get()) is not None:
+            self.run(turn)
+            if self.busy:
                 time.sleep(_PAUSE)
 
 
@@ -91,16 +101,16 @@ _SECOND: Final = 1e9  # ns
 
 
 class LateUpdates:
-    """The late updates of one robot that are not published yet. unpublished: those that never will be, so far.
+    """The late updates of one robot that are not published yet.
 
     Only the newest one of a robot in real time is published, and all of a replay. A late pose of a robot is of use to
     nobody once a newer one is known, and to publish it makes the node later still. The samples of a replay are late by
     themselves, and whoever plays them wants every pose.
     """
 
-    def __init__(self, publish: Callable[[Update], None]) -> None:
-        self.unpublished = 0
+    def __init__(self, publish: Callable[[Update], None], counts: Counts) -> None:
         self._publish = publish
+        self._counts = counts
         self._waiting: list[Update] = []
         self._first: tuple[float, int] | None = None  # arrival (s) and stamp (ns) of the first since one was on time
         self._replayed = False  # since then samples have come much faster than they were measured
@@ -114,20 +124,17 @@ class LateUpdates:
             self._replayed = measured > _FAST * (arrival - self._first[0])
             self._waiting.append(update)
 
-    def on_time(self) -> None:
-        """Publish what waits before an update that is on time."""
-        self.publish_waiting(newer_follows=True)
-        self._first = None
-
-    def publish_waiting(self, *, newer_follows: bool = False) -> None:
-        """Publish what waits, at the end of a turn or before a newer update."""
-        waiting, self._waiting = self._waiting, []
-        if waiting and not self._replayed:
-            last = len(waiting) - (not newer_follows)
-            self.unpublished += last
-            waiting = waiting[last:]
-        for update in waiting:
+    def publish(self, on_time: Sequence[Update] = ()) -> None:
+        """Publish what waits, at the end of a turn, or before updates that are on time."""
+        if self._waiting and not self._replayed:
+            last = len(self._waiting) - (not on_time)
+            self._counts.unpublished += last
+            del self._waiting[:last]
+        updates, self._waiting = [*self._waiting, *on_time], []
+        for update in updates:
             self._publish(update)
+        if on_time:
+            self._first = None
 
 
 _LONGEST_QUEUE: Final = 20_000  # messages that wait for one robot, 200 s at 100 Hz; chosen
@@ -135,23 +142,23 @@ _LARGEST_QUEUE: Final = 32_000_000  # bytes that wait for one robot: 20,000 mess
 _BATCH: Final = 500  # messages of one robot until the others have their turn; chosen
 
 
-@dataclass(frozen=True, slots=True)
-class _Message:
-    """A message that waits. arrival: s, monotonic."""
+class _Message(NamedTuple):
+    """A message that waits. arrival: s, monotonic. flow: its place in an acknowledged flow, whose sender waits."""
 
     is_pose: bool
     arrival: float
     payload: bytes
     attachment: bytes | None
+    flow: Flow | None
 
 
 class RobotService:
     """Subscribes to a robot's wheels and SLAM, hands them to its tracker, and publishes the updates.
 
-    Messages are queued in Zenoh's threads and taken in that of ``intake``, in the order in which they came. Where they
-    come faster than they can be taken, all are integrated and only the newest of the late ones is published
-    (`LateUpdates`), but for those of an acknowledged flow, whose sender waits. A message that fails is counted and
-    logged.
+    Messages are queued in Zenoh's threads, and taken in the order in which they came by the turns of ``intake``: in the
+    same thread at once, unless others wait or much is to be done. Where they come faster than they can be taken, all
+    are integrated and only the newest of the late ones is published (`LateUpdates`), but for those of an acknowledged
+    flow, whose sender waits. A message that fails is counted and logged.
     """
 
     def __init__(self, graph: GraphNode, tracker: RobotTracker, intake: Intake) -> None:
@@ -164,7 +171,7 @@ class RobotService:
         self._counting = threading.Lock()  # held while those bytes change
         self._scheduled = False  # a turn is queued, or has not yet looked at what waits
         self._working = threading.Lock()  # held while messages are taken
-        self._late = LateUpdates(self._publish)
+        self._late = LateUpdates(self._publish, tracker.counts)
         self._missed = MissedMessages()  # among the robot's own wheel messages, which are in no flow
         self._flows = AcknowledgedFlows(graph.session, name, tracker.flows)
         self._rate_limiter = RateLimiter()
@@ -172,7 +179,7 @@ class RobotService:
         self._logged_refusals = 0
         self._logged_status = ""
         self._outputs = [
-            (graph.publisher(name, output.topic), output.encoding(tracker.frames))
+            (graph.publisher(name, output.topic).put_encoded, output.encoding(tracker.frames))
             for output in OUTPUTS
             if tracker.fusing or not output.fused
         ]
@@ -212,7 +219,6 @@ class RobotService:
             self._take_turn()
         with self._working:  # a turn that is under way ends first
             self.tracker.close()
-            self._flows.close()
         self._token.undeclare()
 
     def _receive_poses(self) -> None:
@@ -223,20 +229,28 @@ class RobotService:
             )
 
     def _queue(self, is_pose: bool, sample: zenoh.Sample) -> None:
-        """Queue a message; in Zenoh's thread."""
-        size = len(sample.payload)
+        """Queue a message, and take it at once where nothing else is to be done; in Zenoh's thread."""
+        arrival, payload, attachment = time.monotonic(), sample.payload.to_bytes(), sample.attachment
         with self._counting:
-            full = len(self._waiting) >= _LONGEST_QUEUE or self._waiting_bytes + size > _LARGEST_QUEUE
-            self._waiting_bytes += 0 if full else size
+            full = len(self._waiting) >= _LONGEST_QUEUE or self._waiting_bytes + len(payload) > _LARGEST_QUEUE
+            self._waiting_bytes += 0 if full else len(payload)
         if full:
-            self.tracker.count_overflow()
+            self.tracker.count("overflow")
             return
-        attachment = sample.attachment
         content = None if attachment is None else attachment.to_bytes()
-        self._waiting.append(_Message(is_pose, time.monotonic(), sample.payload.to_bytes(), content))
-        if not self._scheduled:
-            self._scheduled = True
-            self._intake.ready(self._take_turn)
+        flow = flow_of(content)
+        self._waiting.append(_Message(is_pose, arrival, payload, content, flow))
+        if self._scheduled:
+            return
+        self._scheduled = True
+        # Messages of a flow are taken together, so that one saved state and one acknowledgement stand for many.
+        if flow is None and not self._intake.busy and self._working.acquire(blocking=False):
+            try:
+                self._intake.run(self._take_waiting)
+            finally:
+                self._working.release()
+        else:
+            self._intake.queue(self._take_turn)
 
     def _waiting_since(self) -> float | None:
         """When the oldest message that waits came, s, monotonic; None if none waits, or if its sender waits, too."""
@@ -244,65 +258,64 @@ class RobotService:
             oldest = self._waiting[0]
         except IndexError:
             return None
-        return oldest.arrival if flow_of(oldest.attachment) is None else None
+        return oldest.arrival if oldest.flow is None else None
 
     def _take_turn(self) -> None:
-        """Take the messages that wait, at most a batch."""
         with self._working:
-            self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
-            behind, unpublished = 0.0, self._late.unpublished
-            for _ in range(min(len(self._waiting), _BATCH)):
-                message = self._waiting.popleft()
-                with self._counting:
-                    self._waiting_bytes -= len(message.payload)
-                flow = flow_of(message.attachment)
-                if flow is None:
-                    waited = time.monotonic() - message.arrival
-                    behind = max(behind, waited)
-                    skipped = 0 if message.is_pose else self._missed.take(message.attachment) or 0
-                    self._take(message, late=waited > LATE, skipped=skipped)
-                    continue
-                self._receive_poses()
-                if self._flows.accepts(flow):
-                    self._take(message, late=False, published=self._flows.inherited(flow), replayed=True)
-            self._late.publish_waiting()
-            if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
-                self.tracker.save()
-                self._flows.acknowledge()
-            self.tracker.record_backlog(behind, self._late.unpublished - unpublished)
-            if self._waiting and not self._scheduled:
-                self._scheduled = True
-                self._intake.ready(self._take_turn)
+            self._take_waiting()
 
-    def _take(
-        self, message: _Message, *, late: bool, published: bool = False, skipped: int = 0, replayed: bool = False
-    ) -> None:
+    def _take_waiting(self) -> None:
+        """Take the messages that wait, at most a batch; by who holds ``_working``."""
+        self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
+        behind = 0.0
+        for _ in range(min(len(self._waiting), _BATCH)):
+            message = self._waiting.popleft()
+            with self._counting:
+                self._waiting_bytes -= len(message.payload)
+            if message.flow is None:
+                waited = time.monotonic() - message.arrival
+                behind = max(behind, waited)
+                skipped = 0 if message.is_pose else self._missed.take(message.attachment) or 0
+                self._take(message, skipped, late=waited > LATE)
+                continue
+            self._receive_poses()
+            if self._flows.accepts(message.flow):
+                self._take(message, published=self._flows.inherited(message.flow))
+        self._late.publish()
+        if self._flows.heard:  # the sender forgets what is acknowledged: the state has to hold it before
+            self.tracker.save()
+            self._flows.acknowledge()
+        self.tracker.record_backlog(behind)
+        if self._waiting and not self._scheduled:
+            self._scheduled = True
+            self._intake.queue(self._take_turn)
+
+    def _take(self, message: _Message, skipped: int = 0, *, late: bool = False, published: bool = False) -> None:
         """Take a message, and publish its updates unless it is late, or they may be published already.
 
-        skipped: messages before it that never came, by the sender's numbers. replayed: it comes in a flow.
+        skipped: messages before it that never came, by the sender's numbers.
         """
+        replayed = message.flow is not None
         try:
             if message.is_pose:
                 self.tracker.take_pose(message.payload, message.arrival, replayed=replayed)
                 return
             updates = self.tracker.take_wheels(message.payload, message.arrival, skipped, replayed=replayed)
             if published:
-                self._late.unpublished += len(updates)
+                self.tracker.counts.unpublished += len(updates)
             elif late:
                 self._late.take(message.arrival, updates)
             elif updates:
-                self._late.on_time()
-                for update in updates:
-                    self._publish(update)
+                self._late.publish(updates)
         except Exception as error:  # the stream has to go on
             input_name = "pose" if message.is_pose else "wheels"
-            self.tracker.count_failure()
+            self.tracker.count("failures")
             if self._rate_limiter.allows(input_name):
                 LOG.error("%s: a %s message failed: %s: %s", self.tracker.name, input_name, type(error).__name__, error)
 
     def _publish(self, update: Update) -> None:
-        for publisher, encoded in self._outputs:
-            publisher.put_encoded(encoded(update))
+        for put, encoded in self._outputs:
+            put(encoded(update))
 
 
 _SWITCH_INTERVAL = 0.0005  # s that a busy thread keeps the interpreter while others wait; Python's own is 0.005
@@ -335,59 +348,23 @@ def low_latency() -> Iterator[None]:
                 sys.setswitchinterval(_usual_interval)
 
 
-def make_tracker(config: LiveConfig, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
-    """The tracker of one robot; with a memory it goes on where the last run stopped.
-
-    ConfigError or DataError: the calibration cannot be read, or the joints are not one for each wheel.
-    """
-    calibration = read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration)
-    tracker = RobotTracker(
-        robot.name,
-        calibration,
-        wheels=robot.wheels,
-        fusion=config.fusion_of(robot),
-        frames=config.frames_of(robot),
-        stale_after=config.stale_after,
-        memory=memory,
-    )
-    saved = None if memory is None else memory.load()
-    if saved is not None:
-        tracker.resume(saved, time.monotonic(), time.time())
-        x, y, _ = saved.pose
-        LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, x, y)
-    return tracker
-
-
 _PERIOD = 1.0  # s, as ROS 2's diagnostics usually come
 
 
-class DiagnosticsTimer:
-    """Calls the services' ``publish_diagnostics`` once a second, in a thread of its own, until ``close``.
+def publish_diagnostics(services: Sequence[RobotService], stop: threading.Event) -> None:
+    """Publish the services' diagnostics once a second until stopped.
 
     A robot whose diagnostics fail does not stop those of the others; each kind of its errors is logged once.
     """
-
-    def __init__(self, services: Sequence[RobotService]) -> None:
-        self._services = services
-        self._log_limiter = RateLimiter(math.inf)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="diagnostics", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Publish no more."""
-        self._stop.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stop.wait(_PERIOD):
-            for service in self._services:
-                try:
-                    service.publish_diagnostics()
-                except Exception as error:
-                    name, kind = service.tracker.name, type(error).__name__
-                    if self._log_limiter.allows(f"{name} {kind}"):
-                        LOG.error("%s: diagnostics: %s: %s", name, kind, one_line(str(error)))
+    log_limiter = RateLimiter(math.inf)
+    while not stop.wait(_PERIOD):
+        for service in services:
+            try:
+                service.publish_diagnostics()
+            except Exception as error:
+                name, kind = service.tracker.name, type(error).__name__
+                if log_limiter.allows(f"{name} {kind}"):
+                    LOG.error("%s: diagnostics: %s: %s", name, kind, one_line(str(error)))
 
 
 _PRESENCE_TIMEOUT = 2.0  # s, at most, for the tokens of other nodes' robots, which mostly come at once; chosen
@@ -412,9 +389,7 @@ class LiveNode(Closing):
                 for robot in config.robots:
                     memories[robot.name] = memory = RobotMemory(config.state, robot.name)
                     started.callback(memory.close)
-            self.trackers = {
-                robot.name: make_tracker(config, robot, memories.get(robot.name)) for robot in config.robots
-            }
+            self.trackers = {robot.name: self._tracker(robot, memories.get(robot.name)) for robot in config.robots}
             self.session = open_session(config.zenoh, f"node {config.name}", stop)
             started.callback(close_session, self.session)
             self._claim_robots(started)
@@ -429,10 +404,16 @@ class LiveNode(Closing):
             self._services = services
             # after the services: a replay begins with the first subscriber, and the samples are for these
             self._serve_foxglove(listeners)
+            self._show_in_rerun(listeners)
             self._record(listeners)
             queries = QueryServer(self.session, self.trackers, partial(robot_info, config, self.keys), memories)
             started.callback(queries.close)
-            started.callback(DiagnosticsTimer(services).close)
+            stopped = threading.Event()
+            arguments = services, stopped
+            diagnostics = threading.Thread(target=publish_diagnostics, args=arguments, name="diagnostics", daemon=True)
+            diagnostics.start()
+            started.callback(diagnostics.join)
+            started.callback(stopped.set)
             started.enter_context(low_latency())
             self._started = started.pop_all()
 
@@ -443,6 +424,22 @@ class LiveNode(Closing):
     def health(self, robot: str) -> Health:
         """A robot's health now."""
         return self.trackers[robot].health(time.monotonic())
+
+    def _tracker(self, robot: RobotConfig, memory: RobotMemory | None) -> RobotTracker:
+        """The tracker of one robot; with a memory it goes on where the last run stopped."""
+        tracker = RobotTracker(
+            robot.name,
+            read_calibration(robot.calibration) if memory is None else memory.calibration(robot.calibration),
+            wheels=robot.wheels,
+            fusion=self.config.fusion_of(robot),
+            frames=self.config.frames_of(robot),
+            stale_after=self.config.stale_after,
+            memory=memory,
+        )
+        if memory is not None and (saved := memory.load()) is not None:
+            tracker.resume(saved, time.monotonic(), time.time())
+            LOG.info("%s: goes on at x %.3f m, y %.3f m of odom", robot.name, *saved.pose[:2])
+        return tracker
 
     def _claim_robots(self, started: ExitStack) -> None:
         """Refuse a robot that another node runs, and warn of tf frames that another node may publish too."""
@@ -467,6 +464,15 @@ class LiveNode(Closing):
         server.forward(self.session, self.keys, list(self.trackers))
         listeners.callback(lambda: _tell_missed("Foxglove", server.missed))
         LOG.warning("Foxglove: open %s", server.address)
+
+    def _show_in_rerun(self, listeners: ExitStack) -> None:
+        """Show the robots in Rerun, if the config asks for it; in a new file where the config's is there already."""
+        if self.config.rerun is False:
+            return
+        file = None if self.config.rerun is True else free_path(self.config.rerun)
+        mounts = {name: tracker.calibration.robot.mount for name, tracker in self.trackers.items()}
+        listeners.enter_context(RerunView(self.session, self.keys, mounts, file))
+        LOG.warning("Rerun: %s", file or "the viewer is open")
 
     def _record(self, listeners: ExitStack) -> None:
         """Record the robots' topics, if the config asks for it; in a new file where the config's is there already."""

@@ -18,12 +18,13 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from omnibench.live.wheels import WheelStep
 from omnibench.robot.calibration import Calibration, Noise
+from omnibench.robot.corrections import TrainingDomain, extrapolation_consequence
 from omnibench.robot.kinematics import Array, Mount, compose, relative, unit_twist
 from omnibench.robot.odometry import Integration, OdometryStream
 
@@ -67,8 +68,7 @@ _CORRELATION = 1.0  # s, correlation time with which the filter takes the matrix
 _REMEMBERED = 200  # steps that are replayed to a new calibration, whose effects depend on the recent motion; chosen
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class Motion(NamedTuple):
     """The robot's motion in one wheel step, as the filter takes it.
 
     stamp: ns, at its end. duration: s. moved (3,): in the robot's frame, m, m, rad. position_variance (m2, each axis),
@@ -85,14 +85,8 @@ class Motion:
 
     def part(self, share: float) -> Motion:
         """The first ``share`` (0 to 1) of the motion, at constant twist."""
-        return Motion(
-            self.stamp,
-            share * self.duration,
-            share * self.moved,
-            self.integration,
-            share * self.position_variance,
-            share * self.heading_variance,
-        )
+        position, heading = share * self.position_variance, share * self.heading_variance
+        return Motion(self.stamp, share * self.duration, share * self.moved, self.integration, position, heading)
 
 
 class LiveOdometry:
@@ -109,6 +103,7 @@ class LiveOdometry:
         self._standstill = standstill
         self._calibration = calibration
         mount, self._drive = calibration.robot.mount, calibration.robot.drive
+        self._direct = self._drive.direct
         self._centre = None if mount is None else RobotCentre(mount)
         self.session_time = 0.0
         self._stream = self._new_stream(self.session_time)
@@ -123,12 +118,15 @@ class LiveOdometry:
         noise = calibration.noise or UNKNOWN_NOISE
         self._position_walk = noise.walk_position**2 or UNKNOWN_NOISE.walk_position**2 / 100
         self._heading_walk = noise.walk_heading**2 or UNKNOWN_NOISE.walk_heading**2 / 100
-        self._walk = _RandomWalk()
+        # W of Eq. (L2) as xx, xy, yy, xt, yt, tt: Python's floats are three times as fast as an array
+        self._walk = (0.0,) * 6
         signals = len(self._drive.names)
-        self._jacobian = _MatrixJacobian(signals, calibration.integration)
-        self._elements: Array | None = None
+        # J of Eq. (L3), (3, 3, M): derivatives of x, y and heading by each row of the matrix
+        self._jacobian: Array = np.zeros((3, 3, signals))
         self._doubts: Array | None = None  # E (3, r) of Eq. (L4), once something was extrapolated
-        self._blocks = np.zeros((3, signals, signals))
+        self._elements: Array | None = None  # C
+        self._blocks = np.zeros((3, signals, signals))  # C of each row of the matrix
+        self._matrix_variances = [0.0, 0.0, 0.0]  # of the twist, by the matrix's covariance and by what is extrapolated
         if calibration.provenance is not None and calibration.provenance.on_bounds:
             LOG.warning(
                 "calibration %r: %s on a bound of the box, of which no variance is known: covariances are too small",
@@ -139,7 +137,6 @@ class LiveOdometry:
             self._elements = np.array(calibration.covariance)[: 3 * signals, : 3 * signals]
             by_row = self._elements.reshape(3, signals, 3, signals)
             self._blocks = np.stack([by_row[row, :, row] for row in range(3)])
-        self._matrix_variances = [0.0, 0.0, 0.0]  # variances of the twist by the matrix's covariance, and by effects
 
     @property
     def driven(self) -> Array:
@@ -149,9 +146,10 @@ class LiveOdometry:
     @property
     def covariance(self) -> Array:
         """Covariance (3, 3) of the pose, Eq. (L1)."""
-        covariance = self._walk.covariance
+        xx, xy, yy, xt, yt, tt = self._walk
+        covariance = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
         if self._elements is not None:
-            jacobian = self._jacobian.values
+            jacobian = self._jacobian.reshape(3, -1)
             covariance = covariance + jacobian @ self._elements @ jacobian.T
         if self._doubts is not None:
             covariance = covariance + self._doubts @ self._doubts.T
@@ -162,13 +160,18 @@ class LiveOdometry:
         """Covariance (3, 3) of the twist in the robot's frame."""
         position, heading = self._position_walk / self._duration, self._heading_walk / self._duration
         along_x, along_y, turning = self._matrix_variances
-        covariance = np.zeros((3, 3))
-        covariance[0, 0], covariance[1, 1] = position + along_x, position + along_y
-        covariance[2, 2] = heading + turning
+        covariance = np.array([[position + along_x, 0, 0], [0, position + along_y, 0], [0, 0, heading + turning]])
         if self._centre is None:
             return covariance
         of_centre: Array = self._centre.of_twist @ covariance @ self._centre.of_twist.T
         return of_centre
+
+    def silence_covariance(self, seconds: float) -> Array:
+        """What a silence adds to the covariance (3, 3) of the pose: the robot may have kept its twist, or stood."""
+        position = (_BLIND_SHARE * math.hypot(self.twist[0], self.twist[1]) * seconds) ** 2
+        position += self._position_walk * seconds
+        heading = (_BLIND_SHARE * abs(float(self.twist[2])) * seconds) ** 2 + self._heading_walk * seconds
+        return np.diag([position, position, heading])
 
     def set_odom_heading(self, heading: float) -> None:
         """Set the heading of odom in the map, rad, along whose axes effects of the world act; at first it is 0."""
@@ -179,18 +182,6 @@ class LiveOdometry:
         self._stream = self._new_stream(session_time)
         self.session_time = session_time
         self._begin(pose, covariance, steering)
-
-    def _begin(self, pose: Array, covariance: Array, steering: Array | None) -> None:
-        self.pose = self._stream.pose = np.array(pose, dtype=float)
-        if self._centre is not None:
-            self._stream.pose = self._centre.tracked(self.pose)
-            covariance = carried(covariance, (self._stream.pose - self.pose)[:2])
-        if steering is not None:
-            self._stream.steer(steering)
-        self._steering = steering
-        self._walk.set(covariance)
-        self._jacobian.clear()
-        self._doubts = None
 
     def continued(self, calibration: Calibration) -> LiveOdometry:
         """Odometry with another calibration from the same pose and covariance on."""
@@ -205,75 +196,92 @@ class LiveOdometry:
         other.twist, other._duration = self.twist, self._duration
         return other
 
-    def step(self, step: WheelStep) -> Motion:
-        """Integrate a wheel step and its covariance; the motion that it made."""
-        before, twist = self._stream.pose, self.twist
-        positions = step.positions
-        self._wheel_angles = self._wheel_angles + step.angles if positions is None else positions
-        self._stream.drive(step.angles, step.duration, self._wheel_angles, step.steering)
-        self._steering = step.steering
-        self.session_time += step.duration
-        self._recent.append(step)
-        moved: Array = self._stream.moved
-        if step.duration > 0:
-            rates = self._signal_rates(step)
-            twist_now = self._stream.matrix @ rates if step.blind else moved / step.duration
-            self.twist = twist_now if self._centre is None else self._centre.of_twist @ twist_now
-            self._duration = step.duration
-            variances = (self._blocks @ rates) @ rates
-            if (extrapolated := self._stream.doubts) is not None:
-                variances = variances + np.square(extrapolated / step.duration).sum(axis=1)
-            self._matrix_variances = variances.tolist()
-        position, heading = self._walk_variances(step, moved, twist)
-        # Eq. (L2) and (L3)
-        x, y, start = before.tolist()
-        to_x, to_y, end = self._stream.pose.tolist()
-        self._walk.carry(to_x - x, to_y - y)
-        self._walk.add(position, heading)
-        if self._elements is not None:
-            self._jacobian.add(self._stream.driven, to_x - x, to_y - y, start, end)
-        if (doubts := self._stream.doubts) is not None or self._doubts is not None:
-            self._add_doubts(doubts, (to_x - x, to_y - y), start, end)
-        moved, integration = self._centre_moved()
-        # A filter has no state for the matrix: the matrix's error counts as noise.
-        along_x, along_y, turning = self._matrix_variances
-        time = _CORRELATION * step.duration
-        position, heading = position + time * (along_x + along_y) / 2, heading + time * turning
-        return Motion(step.stamp, step.duration, moved, integration, position, heading, step.restarted)
-
-    def _signal_rates(self, step: WheelStep) -> Array:
-        """Drive signals (M,) at the end of a step, rad/s."""
-        if self._drive.direct:
-            return step.rates
-        if not step.blind:
-            return self._stream.driven / step.duration
-        steering = None if step.steering is None else step.steering[None]
-        return self._drive.signals(step.rates[None], steering)[0]
-
-    def _centre_moved(self) -> tuple[Array, Integration]:
-        """Bring the pose to that of the stream: the motion (3,) of the centre in its own frame, and along what path."""
-        if self._centre is None:
-            self.pose = self._stream.pose
-            return self._stream.moved, self._stream.integration
-        before, self.pose = self.pose, self._centre.pose(self._stream.pose)
-        return unit_twist(relative(before, self.pose)), "arc"
-
-    def covariance_after_silence(self, seconds: float) -> Array:
-        """Covariance (3, 3) of the pose after a silence, in which the robot may have kept its twist or stood."""
-        position = (_BLIND_SHARE * math.hypot(self.twist[0], self.twist[1]) * seconds) ** 2
-        heading = (_BLIND_SHARE * abs(float(self.twist[2])) * seconds) ** 2
-        growth = [
-            position + self._position_walk * seconds,
-            position + self._position_walk * seconds,
-            heading + self._heading_walk * seconds,
-        ]
-        return self.covariance + np.diag(growth)
-
     def _new_stream(self, session_time: float) -> OdometryStream:
         start = None if self._centre is None else self._centre.start
         return self._calibration.model.stream(start, self._calibration.session, session_time)
 
-    def _walk_variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
+    def _begin(self, pose: Array, covariance: Array, steering: Array | None) -> None:
+        self.pose = self._stream.pose = np.array(pose, dtype=float)
+        if self._centre is not None:
+            self._stream.pose = self._centre.tracked(self.pose)
+            covariance = carried(covariance, (self._stream.pose - self.pose)[:2])
+        if steering is not None:
+            self._stream.steer(steering)
+        self._steering = steering
+        (xx, xy, xt), (_, yy, yt), (_, _, tt) = np.asarray(covariance).tolist()
+        self._walk = xx, xy, yy, xt, yt, tt
+        self._jacobian[:] = 0.0
+        self._doubts = None
+
+    def step(self, step: WheelStep) -> Motion:
+        """Integrate a wheel step and its covariance; the motion that it made."""
+        stream, centre, duration, twist = self._stream, self._centre, step.duration, self.twist
+        before, centre_before = stream.pose, self.pose
+        self._wheel_angles = self._wheel_angles + step.angles if step.positions is None else step.positions
+        after = stream.drive(step.angles, duration, self._wheel_angles, step.steering)
+        moved: Array = stream.moved
+        doubts, integration = stream.doubts, stream.integration
+        self._steering = step.steering
+        self.session_time += duration
+        self._recent.append(step)
+        # Twist at the end of the step, and its variances by the matrix's covariance
+        if duration > 0:
+            if self._direct:
+                rates = step.rates
+            elif not step.blind:
+                rates = stream.driven / duration
+            else:
+                rates = self._drive.signals(step.rates[None], None if step.steering is None else step.steering[None])[0]
+            twist_now = stream.matrix @ rates if step.blind else moved / duration
+            self.twist = twist_now if centre is None else centre.of_twist @ twist_now
+            self._duration = duration
+            variances = (self._blocks @ rates) @ rates
+            if doubts is not None:
+                variances = variances + np.square(doubts / duration).sum(axis=1)
+            self._matrix_variances = variances.tolist()
+        position, heading = self._step_variances(step, moved, twist)
+        # Eq. (L2): W <- F W F^T + Q, with a path in the world's frame whose direction has the heading's error
+        x, y, start = before.tolist()
+        to_x, to_y, end = after.tolist()
+        along_x, along_y = to_x - x, to_y - y
+        xx, xy, yy, xt, yt, tt = self._walk
+        self._walk = (
+            xx + along_y * (along_y * tt - 2 * xt) + position,
+            xy + (along_x * xt - along_y * yt - along_x * along_y * tt),
+            yy + along_x * (along_x * tt + 2 * yt) + position,
+            xt - along_y * tt,
+            yt + along_x * tt,
+            tt + heading,
+        )
+        if self._elements is not None or doubts is not None or self._doubts is not None:
+            # Derivatives (3, 3) of the step in the world's frame by its motion in the robot's frame
+            direction, half = ((start + end) / 2, 0.5) if integration == "arc" else (start, 0.0)
+            cosine, sine = math.cos(direction), math.sin(direction)
+            slopes = np.array([[cosine, -sine, -half * along_y], [sine, cosine, half * along_x], [0.0, 0.0, 1.0]])
+            if self._elements is not None:
+                # Eq. (L3): row 3 turns this step by the heading's error so far, and by half of the turn in the step
+                x_by_row_3, y_by_row_3, turned = self._jacobian[:, 2]
+                x_by_row_3 -= along_y * turned
+                y_by_row_3 += along_x * turned
+                self._jacobian += slopes[:, :, None] * stream.driven
+            if doubts is not None and self._doubts is None:
+                self._doubts = np.zeros_like(doubts)
+            if self._doubts is not None:  # Eq. (L4)
+                self._doubts[0] -= along_y * self._doubts[2]
+                self._doubts[1] += along_x * self._doubts[2]
+                if doubts is not None:
+                    self._doubts += slopes @ doubts
+        self.pose = after
+        if centre is not None:
+            self.pose, integration = centre.pose(after), "arc"
+            moved = unit_twist(relative(centre_before, self.pose))
+        # A filter has no state for the matrix: the matrix's error counts as noise.
+        variance_x, variance_y, turning = self._matrix_variances
+        time = _CORRELATION * duration
+        position, heading = position + time * (variance_x + variance_y) / 2, heading + time * turning
+        return Motion(step.stamp, duration, moved, integration, position, heading, step.restarted)
+
+    def _step_variances(self, step: WheelStep, moved: Array, twist: Array) -> tuple[float, float]:
         """Variances of position (m2) and heading (rad2) that a step adds. twist (3,): before the step."""
         still = max(map(abs, step.angles.tolist())) <= _STILL * step.duration
         share = self._standstill if still and not step.blind else 1.0
@@ -294,74 +302,50 @@ class LiveOdometry:
             self._unsteered += length
         return position, heading
 
-    def _add_doubts(self, moved: Array | None, along: tuple[float, float], start: float, end: float) -> None:
-        """Eq. (L4) for a step along (x, y), m, from heading to heading, rad, whose motion has deviations (3, r)."""
-        if self._doubts is None:
-            assert moved is not None  # something is extrapolated
-            self._doubts = np.zeros_like(moved)
-        self._doubts[0] -= along[1] * self._doubts[2]
-        self._doubts[1] += along[0] * self._doubts[2]
-        if moved is not None:
-            self._doubts += _slopes(self._stream.integration == "arc", *along, start, end) @ moved
+
+_WINDOW = 0.5  # s, over which a twist is averaged before it is judged; chosen
+_TRANSITION = 1.0  # s; a motion that lasts no longer is a transition and does not count; chosen
 
 
-class _RandomWalk:
-    """Covariance W (3, 3) of Eq. (L2), as six Python floats, which is three times as fast as an array."""
+class ExtrapolationMonitor:
+    """Counts the time that a robot drives outside its calibration's training domain; warns in the log the first time.
 
-    def __init__(self) -> None:
-        self._xx = self._xy = self._yy = self._xt = self._yt = self._tt = 0.0
-
-    @property
-    def covariance(self) -> Array:
-        return np.array(
-            [[self._xx, self._xy, self._xt], [self._xy, self._yy, self._yt], [self._xt, self._yt, self._tt]]
-        )
-
-    def set(self, covariance: Array) -> None:
-        (self._xx, self._xy, self._xt), (_, self._yy, self._yt), (_, _, self._tt) = np.asarray(covariance).tolist()
-
-    def carry(self, along_x: float, along_y: float) -> None:
-        """W <- F W F^T for a path (m) in the world's frame, whose direction has the heading's error."""
-        xt, yt, tt = self._xt, self._yt, self._tt
-        self._xx += along_y * (along_y * tt - 2 * xt)
-        self._xy += along_x * xt - along_y * yt - along_x * along_y * tt
-        self._yy += along_x * (along_x * tt + 2 * yt)
-        self._xt -= along_y * tt
-        self._yt += along_x * tt
-
-    def add(self, position: float, heading: float) -> None:
-        """W <- W + Q with variances of each axis (m2) and of the heading (rad2)."""
-        self._xx += position
-        self._yy += position
-        self._tt += heading
-
-
-class _MatrixJacobian:
-    """Derivative J of the pose with respect to the matrix, Eq. (L3), to first order in the turn of one step.
-
-    values (3, 3M): derivatives of (x, y, heading) by the matrix's elements, row by row.
+    seconds: the time so far; None where the calibration has no effects, or does not say what it was fitted to.
     """
 
-    def __init__(self, signals: int, integration: Integration) -> None:
-        self._arc = integration == "arc"
-        self.values = np.zeros((3, 3 * signals))
-        self._by_row = self.values.reshape(3, 3, signals)
+    def __init__(self, robot: str, calibration: Calibration) -> None:
+        self._robot, self._calibration, self._matrix = robot, calibration, calibration.matrix_array
+        self._domain: TrainingDomain | None = None
+        self.seconds: float | None = None
+        if calibration.effects and calibration.driven:
+            self._domain, self.seconds = TrainingDomain(calibration.robot, calibration.driven), 0.0
+        self._lasted = 0.0  # s that the robot has now been outside the domain without a break
+        # rad, integrals of the signals in the present window, and s since it began
+        self._driven, self._elapsed = np.zeros(self._matrix.shape[1]), 0.0
 
-    def clear(self) -> None:
-        self.values[:] = 0.0
-
-    def add(self, driven: Array, along_x: float, along_y: float, start: float, end: float) -> None:
-        """Add a step: integrals (M,) of its signals, rad, path (m) in the world's frame, headings at its ends (rad)."""
-        by_row = self._by_row
-        turned = by_row[2, 2]
-        # row 3 turns this step by the heading's error so far, and by half of the turn in the step itself
-        by_row[0, 2] -= along_y * turned
-        by_row[1, 2] += along_x * turned
-        by_row += _slopes(self._arc, along_x, along_y, start, end)[:, :, None] * driven
-
-
-def _slopes(arc: bool, along_x: float, along_y: float, start: float, end: float) -> Array:
-    """Derivatives (3, 3) of a step along a path (m), between two headings (rad), by its motion in the robot's frame."""
-    direction, half = ((start + end) / 2, 0.5) if arc else (start, 0.0)
-    cosine, sine = math.cos(direction), math.sin(direction)
-    return np.array([[cosine, -sine, -half * along_y], [sine, cosine, half * along_x], [0.0, 0.0, 1.0]])
+    def take(self, step: WheelStep, driven: Array) -> None:
+        """Take a wheel step with the integrals (M,) of its drive signals, rad."""
+        if self._domain is None or self.seconds is None:
+            return
+        driven, elapsed = self._driven + driven, self._elapsed + step.duration
+        if not step.blind and elapsed < _WINDOW:
+            self._driven, self._elapsed = driven, elapsed
+            return
+        self._driven, self._elapsed = np.zeros(len(driven)), 0.0
+        if step.blind:  # its motion is not known
+            return
+        motion = self._matrix @ driven / elapsed
+        if not self._domain.is_outside(motion):
+            self._lasted = 0.0
+            return
+        before, self._lasted = self._lasted, self._lasted + elapsed
+        if self._lasted <= _TRANSITION:
+            return
+        if not self.seconds:
+            names, fading = [term.name for term in self._calibration.effects], self._calibration.plain is not None
+            LOG.warning(
+                "%s: drives motions that %r was not fitted to, such as %s: %s; told once, then counted in health",
+                *(self._robot, self._calibration.name, self._domain.in_words(motion[None])),
+                extrapolation_consequence(names, fading=fading),
+            )
+        self.seconds += self._lasted if before <= _TRANSITION else elapsed

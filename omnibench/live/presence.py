@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Collection
-from threading import Event, Lock
+from threading import Event
 from typing import Final
 
 import zenoh
@@ -35,8 +35,14 @@ def checked_robot(name: str) -> str:
 
 def alive_robots(session: zenoh.Session, timeout: float = 1.0, stop: Event | None = None) -> tuple[str, ...]:
     """The names of the robots whose tokens are declared now, sorted. timeout: s for the router; ``stop`` ends it."""
-    tokens = answers(lambda handler, s: session.liveliness().get(_ALIVE, handler, timeout=s), timeout, stop)
-    return tuple(sorted({_robot(token.key_expr) for token in tokens}))
+    return tuple(sorted({robot for robot, _ in _tokens(session, _ALIVE, timeout, stop)}))
+
+
+def _tokens(session: zenoh.Session, key: str, timeout: float, stop: Event | None = None) -> list[tuple[str, str]]:
+    """Robot and last part of the key of each token that is declared now."""
+    tokens = answers(lambda handler, s: session.liveliness().get(key, handler, timeout=s), timeout, stop)
+    parts = [str(token.key_expr).split("/") for token in tokens]
+    return [(robot, last) for _, robot, last in parts]
 
 
 class Claim:
@@ -46,27 +52,20 @@ class Claim:
     """
 
     def __init__(self, session: zenoh.Session, robots: Collection[str], timeout: float) -> None:
-        own = str(session.zid())
-        liveliness = session.liveliness()
-        self._tokens = [liveliness.declare_token(f"omnibench/{robot}/claim-{own}") for robot in robots]
+        own = f"claim-{session.zid()}"
+        self._tokens = [session.liveliness().declare_token(f"omnibench/{robot}/{own}") for robot in robots]
+        deadline = time.monotonic() + _PATIENCE
         try:
-            deadline = time.monotonic() + _PATIENCE
             while True:
-                # Robots that are claimed, and the sessions that claim them.
-                replies = session.liveliness().get(_CLAIMS, timeout=timeout)
-                keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-                rivals = [
-                    (robot, rival)
-                    for robot, rival in [(key.split("/")[1], key.rpartition("/claim-")[2]) for key in keys]
-                    if robot in robots and rival != own
-                ]
+                claims = _tokens(session, _CLAIMS, timeout)
+                rivals = {robot: claim for robot, claim in claims if robot in robots and claim != own}
                 self.others = alive_robots(session, timeout)  # after the claims: one that has gone may run by now
-                for robot in robots:
-                    if robot in self.others:
-                        raise _taken(robot, "is run by another node already; stop that")
-                for robot, rival in rivals:
-                    if rival < own or time.monotonic() > deadline:
-                        raise _taken(robot, "is being started by another node at this moment; leave it to that")
+                overdue = time.monotonic() > deadline
+                first = {robot for robot, claim in claims if robot in rivals and (claim < own or overdue)}
+                why = dict.fromkeys(first, "is being started by another node at this moment; leave it to that")
+                why |= dict.fromkeys(set(robots) & set(self.others), "is run by another node already; stop that")
+                for robot, reason in why.items():  # two nodes for one robot would publish every stamp twice
+                    raise ConfigError(f"robot {robot!r} {reason}, or give this one's another name")
                 if not rivals:
                     break
                 time.sleep(_LOOKING)
@@ -78,11 +77,6 @@ class Claim:
         """Withdraw the claim."""
         for token in self._tokens:
             token.undeclare()
-
-
-def _taken(robot: str, why: str) -> ConfigError:
-    """Two nodes for one robot would publish every stamp twice."""
-    return ConfigError(f"robot {robot!r} {why}, or give this one's another name")
 
 
 def nothing_received(robot: str, seconds: float, alive: tuple[str, ...]) -> str:
@@ -102,31 +96,21 @@ class Presence:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._is_alive: dict[str, bool] = {}
-        self._lock = Lock()
         self._subscriber = session.liveliness().declare_subscriber(_ALIVE, direct(self._changed), history=True)
 
     @property
     def alive(self) -> tuple[str, ...]:
         """The names of the robots whose tokens are declared, sorted."""
-        return self._names(alive=True)
+        return tuple(sorted(robot for robot, is_alive in self._is_alive.copy().items() if is_alive))
 
     @property
     def left(self) -> tuple[str, ...]:
         """The names of the robots whose tokens were declared and are not any more, sorted."""
-        return self._names(alive=False)
+        return tuple(sorted(robot for robot, is_alive in self._is_alive.copy().items() if not is_alive))
 
     def close(self) -> None:
         """Stop tracking."""
         self._subscriber.undeclare()
 
     def _changed(self, sample: zenoh.Sample) -> None:
-        with self._lock:
-            self._is_alive[_robot(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
-
-    def _names(self, alive: bool) -> tuple[str, ...]:
-        with self._lock:
-            return tuple(sorted(name for name, is_alive in self._is_alive.items() if is_alive is alive))
-
-
-def _robot(key: zenoh.KeyExpr) -> str:
-    return str(key).split("/")[1]
+        self._is_alive[str(sample.key_expr).split("/")[1]] = sample.kind == zenoh.SampleKind.PUT

@@ -47,12 +47,11 @@ def stop_on_signals() -> Iterator[Stop]:
     A second signal acts as usual, in case the command does not end.
     """
     stop = Stop()
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) for number in signals}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def restore() -> None:
-        for number in signals:
-            signal.signal(number, before[number])
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def handle(number: int, _frame: object) -> None:
         stop.number = number
@@ -60,7 +59,7 @@ def stop_on_signals() -> Iterator[Stop]:
         threading.Thread(target=stop.set).start()
         restore()
 
-    for number in signals:
+    for number in before:
         signal.signal(number, handle)
     try:
         yield stop

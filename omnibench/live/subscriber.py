@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Final, get_args
 
 import zenoh
@@ -14,9 +15,8 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from omnibench.config import validate
 from omnibench.errors import ConfigError, require_choice
-from omnibench.live.network import close_session, open_session
+from omnibench.live.network import SessionConfig, close_session, open_session
 from omnibench.live.presence import checked_robot
-from omnibench.live.session_config import SessionConfig
 from omnibench.live.stopping import Closing, RateLimiter
 from omnibench.live.topics import TOPICS, KeySpace, Profile
 from omnibench.live.wire import ODOMETRY, MessageError, MissedMessages, Odometry
@@ -90,13 +90,10 @@ class Subscription(Closing):
         session: zenoh.Session | None,
         lossless: bool,
     ) -> None:
-        self.received = 0
-        self.undecodable = 0
-        self.callback_errors = 0
+        self.received = self.undecodable = self.callback_errors = 0
         self._subscriber = subscriber
         self._channel = subscriber.handler  # readers wait in the channel, so that the subscriber can be closed
         self._session = session
-        self._callback = callback
         self._lossless = lossless
         self._numbers = MissedMessages()
         self._log_limiter = RateLimiter(math.inf)
@@ -115,7 +112,7 @@ class Subscription(Closing):
         return self._numbers.count
 
     def __iter__(self) -> Iterator[Odometry]:
-        if self._callback is not None:
+        if self._thread is not None:
             raise ConfigError("this subscription hands its messages to a callback; iterate over one without")
         return self._messages()
 
@@ -123,17 +120,16 @@ class Subscription(Closing):
         """The newest message that was not returned before; waits up to ``timeout`` s, then None."""
         deadline = time.monotonic() + timeout
         newest = None
-        try:
+        with suppress(zenoh.ZError):  # the subscription was closed
             while True:
                 sample = self._channel.try_recv()
                 if sample is not None:
                     newest = self._decoded(sample) or newest
                 elif newest is not None or time.monotonic() >= deadline:
-                    return newest
+                    break
                 else:
                     time.sleep(_POLL_PERIOD)
-        except zenoh.ZError:  # the subscription was closed
-            return newest
+        return newest
 
     def close(self) -> None:
         """End the stream, also for a reader that waits for a message. Closing twice does no harm."""
@@ -147,14 +143,11 @@ class Subscription(Closing):
             self._thread.join()
 
     def _messages(self) -> Iterator[Odometry]:
-        while True:
-            try:
-                sample = self._channel.recv()
-            except zenoh.ZError:  # the subscription was closed
-                return
-            message = self._decoded(sample)
-            if message is not None:
-                yield message
+        with suppress(zenoh.ZError):  # the subscription was closed
+            while True:
+                message = self._decoded(self._channel.recv())
+                if message is not None:
+                    yield message
 
     def _decoded(self, sample: zenoh.Sample) -> Odometry | None:
         if sample.kind != zenoh.SampleKind.PUT:

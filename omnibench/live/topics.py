@@ -4,19 +4,12 @@ plain: the key is the topic's name, as the DDS bridge (zenoh-bridge-ros2dds) map
 a ROS 2 node on rmw_zenoh; without tokens ``ros2 topic list`` would not show the topic. humble: rmw with Humble's
 placeholder for type hashes. Messages of all profiles carry rmw_zenoh's attachment, without which ROS 2 would drop them.
 
-Acknowledged flows: a node takes each message of a replay once and in order, and tells which it expects next. The rule
-is go-back-n: a message after a gap is refused, and the sender sends again from the first that is missing. A node that
-does not know a flow, since it has just started, expects the lowest number that the sender has no acknowledgement of.
-What is sent again to it may have been taken by a node that was killed before it could acknowledge, and whose odometry
-is out: it is integrated, but not published a second time.
-
 Outputs: the topics that a node publishes of every update, one function a topic that makes its message.
 
-To add an output, write its function and its row in OUTPUTS; a message type that is new goes to messages.py.
+To add an output, write its function and its row in OUTPUTS; a message type that is new goes to wire.py.
 
-One robot's messages, in which only stamps and numbers change, have a fast CDR of their own. rosbags encodes or decodes
-the first message; for the later ones only the bytes of its stamps and numbers are exchanged, which is several times as
-fast.
+Wheel samples and odometry, the two that come at the wheels' rate, have a fast CDR of their own: rosbags decodes or
+encodes the first message, and the later ones differ from it in stamps and numbers only.
 """
 
 from __future__ import annotations
@@ -37,13 +30,15 @@ import zenoh
 from pydantic import Field, model_validator
 
 from omnibench.config import Model
-from omnibench.errors import UnknownNameError
+from omnibench.errors import require_choice
 from omnibench.live import wire
 from omnibench.live.presence import checked_robot
 from omnibench.live.stopping import direct
 from omnibench.robot.kinematics import Array, correction
 
 _SECOND = 1_000_000_000
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"  # the CDR header
+_STAMP = struct.Struct("<iI")
 _STAMP_AT = 4  # byte at which the stamp begins: after the CDR header
 _NUMBERS = 7 + 36 + 6 + 36  # float64 values at the end of an Odometry: pose, covariance, twist, covariance
 _TWIST = 7 + 36  # index of the twist among these
@@ -62,37 +57,13 @@ class OdometryEncoder:
 
     def encode(self, message: wire.Odometry) -> bytes:
         """The message in CDR."""
-        struct.pack_into("<iI", self._buffer, _STAMP_AT, message.stamp // _SECOND, message.stamp % _SECOND)
+        _STAMP.pack_into(self._buffer, _STAMP_AT, *divmod(message.stamp, _SECOND))
         numbers = self._numbers
-        _write_pose(numbers, message.pose)
+        numbers[0], numbers[1], heading = message.pose.tolist()
+        numbers[5], numbers[6] = math.sin(heading / 2), math.cos(heading / 2)
         numbers[_POSE_COVARIANCE] = message.pose_covariance.ravel()
         numbers[_TWIST], numbers[_TWIST + 1], numbers[_TWIST + 5] = message.twist.tolist()
         numbers[_TWIST_COVARIANCE] = message.twist_covariance.ravel()
-        return bytes(self._buffer)
-
-
-class TransformsEncoder:
-    """Encodes transforms between constant frames into the same bytes as ``TRANSFORMS.encode``."""
-
-    def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        marks = [wire.Transform((index + 1) * _SECOND, *pair, np.zeros(3)) for index, pair in enumerate(frames)]
-        self._buffer = bytearray(wire.TRANSFORMS.encode(marks))
-        self._stamps: list[int] = []
-        self._poses: list[Array] = []
-        place = _STAMP_AT
-        for index in range(len(frames)):
-            place = self._buffer.index(struct.pack("<iI", index + 1, 0), place)
-            # an identity rotation ends with the values 0, 0, 1, which are the last of the pose's seven
-            pose = self._buffer.index(struct.pack("<ddd", 0.0, 0.0, 1.0), place) - 4 * 8
-            self._stamps.append(place)
-            self._poses.append(np.frombuffer(self._buffer, "<f8", 7, pose))
-            place = pose + 7 * 8
-
-    def encode(self, transforms: Sequence[wire.Transform]) -> bytes:
-        """The transforms in CDR."""
-        for place, numbers, transform in zip(self._stamps, self._poses, transforms, strict=True):
-            struct.pack_into("<iI", self._buffer, place, transform.stamp // _SECOND, transform.stamp % _SECOND)
-            _write_pose(numbers, transform.pose)
         return bytes(self._buffer)
 
 
@@ -100,67 +71,38 @@ class JointStateDecoder:
     """Decodes one sender's wheel messages, with constant joint names, to the same as ``JOINT_STATE.decode``."""
 
     def __init__(self) -> None:
-        self._length = -1
-        self._constant: tuple[tuple[slice, bytes], ...] = ()  # the parts of a payload that do not change
-        self._template: wire.JointState | None = None
-        self._positions = self._velocities = 0  # bytes at which they begin; 0: there are none
-        self._joints = 0
+        self._names: tuple[str, ...] = ()
+        self._frame = ""
+        self._constant = b""  # of the last message that rosbags decoded, from its stamp's end: frame and joint names
 
     def decode(self, payload: bytes) -> wire.JointState:
         """The message in a payload. MessageError: as from ``JOINT_STATE.decode``."""
-        template = self._template
-        if template is None or len(payload) != self._length or any(payload[at] != part for at, part in self._constant):
-            return self._learn(payload)
-        seconds, nanoseconds = struct.unpack_from("<iI", payload, _STAMP_AT)
-        if nanoseconds >= _SECOND:
-            return self._learn(payload)  # raises MessageError
-        count, positions, velocities = self._joints, self._positions, self._velocities
-        return wire.JointState(
-            seconds * _SECOND + nanoseconds,
-            template.names,
-            np.frombuffer(payload, "<f8", count, positions) if positions else None,
-            np.frombuffer(payload, "<f8", count, velocities) if velocities else None,
-            template.frame,
-        )
-
-    def _learn(self, payload: bytes) -> wire.JointState:
-        """Decode by rosbags and remember where the numbers are, if the message has no efforts."""
+        begin = _STAMP_AT + _STAMP.size
+        at = begin + len(self._constant)
+        if self._constant and payload.startswith(_LITTLE_ENDIAN) and payload.startswith(self._constant, begin):
+            seconds, nanoseconds = _STAMP.unpack_from(payload, _STAMP_AT)
+            sequences: list[Array | None] = []  # positions, velocities, efforts
+            for _ in range(3):
+                if at + 4 > len(payload):
+                    break
+                length = int.from_bytes(payload[at : at + 4], "little")
+                at += 4
+                if not length:
+                    sequences.append(None)
+                    continue
+                at += -(at - _STAMP_AT) % 8
+                if length != len(self._names) or at + 8 * length > len(payload):
+                    break
+                sequences.append(np.frombuffer(payload, "<f8", length, at))
+                at += 8 * length
+            if len(sequences) == 3 and at == len(payload) and nanoseconds < _SECOND:
+                positions, velocities, _ = sequences
+                return wire.JointState(seconds * _SECOND + nanoseconds, self._names, positions, velocities, self._frame)
         message = wire.JOINT_STATE.decode(payload)
-        self._template = None
-        count = len(message.names)
-        place = len(payload) - 4  # where the number of efforts begins
-        numbers_given = count and (message.positions is not None or message.velocities is not None)
-        if payload[:4] != b"\x00\x01\x00\x00" or payload[place:] != bytes(4) or not numbers_given:
-            return message
-        size = 8 * count
-        self._velocities = self._positions = 0
-        end = (
-            place - 4
-        )  # end of the positions: their successor, the number of velocities, takes 4 bytes if there are none
-        if message.velocities is not None:
-            self._velocities = place - size
-            end = self._velocities - 8
-        if message.positions is not None:
-            self._positions = end - size
-        changing = [(_STAMP_AT, _STAMP_AT + 8)]
-        changing += [(begin, begin + size) for begin in (self._positions, self._velocities) if begin]
-        ends = [0, *(end for _, end in changing)]
-        begins = [*(begin for begin, _ in changing), len(payload)]
-        constant = (slice(*bounds) for bounds in zip(ends, begins, strict=True))
-        self._constant = tuple((at, payload[at]) for at in constant)
-        self._length, self._joints = len(payload), count
-        self._template = message
-        check = self.decode(payload)  # if this does not give the same, rosbags decodes the next message too
-        for fast, general in ((check.positions, message.positions), (check.velocities, message.velocities)):
-            if fast is not None and (general is None or fast.tobytes() != general.tobytes()):
-                self._template = None
+        self._names, self._frame = message.names, message.frame
+        bare = wire.JOINT_STATE.encode(wire.JointState(0, message.names, frame=message.frame))
+        self._constant = bare[begin:-12]  # without the three lengths of its sequences
         return message
-
-
-def _write_pose(numbers: Array, pose: Array) -> None:
-    """Write a pose (3,) into the numbers x, y, z and quaternion, of which z, qx and qy stay 0."""
-    numbers[0], numbers[1], heading = pose.tolist()
-    numbers[5], numbers[6] = math.sin(heading / 2), math.cos(heading / 2)
 
 
 FrameName = Annotated[str, Field(pattern=r"^[^\s/][^\s]*$", max_length=200)]
@@ -201,18 +143,20 @@ class Output:
     """One topic that is published of every update.
 
     topic: below the robot's name. message: makes a message from an update. fused: only where SLAM poses are fused.
-    encoder: makes, for a robot's frames, a function that encodes messages faster than ``message_type`` does.
+    frame: the field of Frames in which it is, for odometry, which is encoded faster then.
     """
 
     topic: str
     message_type: wire.MessageType[Any]
     message: Callable[[Update, Frames], Any]
     fused: bool = False
-    encoder: Callable[[Frames], Callable[[Any], bytes]] | None = None
+    frame: Literal["odom", "map"] | None = None
 
     def encoding(self, frames: Frames) -> Callable[[Update], bytes]:
         """The function from an update to its payload in CDR, for a robot with these frames."""
-        message, encode = self.message, self.encoder(frames) if self.encoder else self.message_type.encode
+        message, encode = self.message, self.message_type.encode
+        if self.frame:
+            encode = OdometryEncoder(getattr(frames, self.frame), frames.base).encode
         return lambda update: encode(message(update, frames))
 
 
@@ -239,26 +183,9 @@ def transforms(update: Update, frames: Frames) -> tuple[wire.Transform, wire.Tra
 
 
 OUTPUTS: Final = (
-    Output(
-        "odom",
-        wire.ODOMETRY,
-        odometry,
-        encoder=lambda frames: OdometryEncoder(frames.odom, frames.base).encode,
-    ),
-    Output(
-        "odometry/filtered",
-        wire.ODOMETRY,
-        filtered_odometry,
-        fused=True,
-        encoder=lambda frames: OdometryEncoder(frames.map, frames.base).encode,
-    ),
-    Output(
-        "tf",
-        wire.TRANSFORMS,
-        transforms,
-        fused=True,
-        encoder=lambda frames: TransformsEncoder(((frames.map, frames.odom), (frames.odom, frames.base))).encode,
-    ),
+    Output("odom", wire.ODOMETRY, odometry, frame="odom"),
+    Output("odometry/filtered", wire.ODOMETRY, filtered_odometry, fused=True, frame="map"),
+    Output("tf", wire.TRANSFORMS, transforms, fused=True),
 )
 
 
@@ -431,7 +358,10 @@ class TopicListener:
         self._consume = consume
         self._time = 0
         self._lock = Lock()
-        sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in _pairs(robots, topics)}
+        for topic in topics:
+            require_choice("topic", topic, TOPICS)
+        pairs = ((checked_robot(robot), topic) for robot in robots for topic in topics)
+        sources = {f"/{topic_name(robot, topic)}": (robot, topic) for robot, topic in pairs}
         self.topics = {name: topic for name, (_, topic) in sources.items()}  # all robots share tf
         self._missed = {name: wire.MissedMessages() for name in sources}
         self._subscribers: list[zenoh.Subscriber[None]] = []
@@ -460,110 +390,3 @@ class TopicListener:
                 return
             self._time = max(self._time, time.time_ns())  # readers of recordings expect increasing times
             self._consume(Arrival(name, topic, self._time, payload))
-
-
-def _pairs(robots: Sequence[str], topics: Sequence[str]) -> list[tuple[str, str]]:
-    for topic in topics:
-        if topic not in TOPICS:
-            raise UnknownNameError("topic", topic, TOPICS)
-    return [(checked_robot(robot), topic) for robot in robots for topic in topics]
-
-
-_ACKNOWLEDGEMENT: Final = struct.Struct("<Q?")
-_MOST_FLOWS: Final = 16  # of one robot at once; another one takes the oldest one's place; chosen
-
-
-def acknowledgement_key(robot: str, flow: int | str) -> str:
-    """The key to which a node acknowledges a flow; ``*`` stands for all."""
-    return f"omnibench/{robot}/received/{flow if isinstance(flow, str) else format(flow, 'x')}"
-
-
-def read_acknowledgement(payload: bytes) -> tuple[int, bool]:
-    """The number that the node expects next, and whether it refused one after a gap. struct.error: it is damaged."""
-    expected, gap = _ACKNOWLEDGEMENT.unpack(payload)
-    return expected, gap
-
-
-class _ReceivedFlow:
-    """One flow to a robot.
-
-    expected: number of its next message. gap: one after a gap was refused. inherited: only messages that were sent
-    before have come, perhaps to another node.
-    """
-
-    def __init__(self, session: zenoh.Session, robot: str, flow: int, expected: int) -> None:
-        self.expected = expected
-        self.gap = False
-        self.inherited = True
-        self._publisher = session.declare_publisher(
-            acknowledgement_key(robot, flow),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME,
-        )
-
-    def acknowledge(self) -> None:
-        self._publisher.put(_ACKNOWLEDGEMENT.pack(self.expected, self.gap))
-        self.gap = False
-
-    def close(self) -> None:
-        self._publisher.undeclare()
-
-
-class AcknowledgedFlows:
-    """The flows to one robot. For one thread.
-
-    expected: flow -> number of its next message, which outlives the node with the odometry that holds those before it.
-    """
-
-    def __init__(self, session: zenoh.Session, robot: str, expected: dict[int, int]) -> None:
-        self._session, self._robot = session, robot
-        self._expected = expected
-        self._flows: dict[int, _ReceivedFlow] = {}
-        self._heard: set[_ReceivedFlow] = set()  # flows with messages since the last acknowledgement
-
-    def accepts(self, place: wire.Flow) -> bool:
-        """True if a message at this place is the flow's next one, and is to be taken."""
-        identity, number, unacknowledged, again = place
-        flow = self._flows.get(identity)
-        if flow is None:
-            expected = self._expected.get(identity, 0)
-            flow = self._flows[identity] = _ReceivedFlow(self._session, self._robot, identity, expected)
-            if len(self._flows) > _MOST_FLOWS:
-                self._forget(next(iter(self._flows)))
-        self._heard.add(flow)
-        flow.expected = max(flow.expected, unacknowledged)  # the sender does not repeat what another node took
-        if number != flow.expected:
-            flow.gap |= number > flow.expected
-            return False
-        flow.expected += 1
-        self._expected[identity] = flow.expected
-        flow.inherited &= again
-        return True
-
-    def inherited(self, place: wire.Flow) -> bool:
-        """True if the odometry of a message that was accepted may be out already, published by a node before this."""
-        return self._flows[place[0]].inherited
-
-    @property
-    def heard(self) -> bool:
-        """True if there were messages since the last acknowledgement."""
-        return bool(self._heard)
-
-    def acknowledge(self) -> None:
-        """Tell the senders of all messages since the last call which number is expected next."""
-        for flow in self._heard:
-            flow.acknowledge()
-        self._heard.clear()
-
-    def close(self) -> None:
-        """Acknowledge no more."""
-        self._heard.clear()
-        for flow in self._flows.values():
-            flow.close()
-        self._flows.clear()
-
-    def _forget(self, identity: int) -> None:
-        flow = self._flows.pop(identity)
-        self._expected.pop(identity, None)
-        self._heard.discard(flow)
-        flow.close()

@@ -1,111 +1,305 @@
 """One robot's estimation: from the payload that a subscriber receives to the update that is published.
 
-A wheel sample is decoded, put in order and repaired, integrated to odometry with its covariance, fused with the poses
-of SLAM, and published. A pose of SLAM is decoded and checked, corrected for the calibration's effects on the
-reference (latency, lever arm of the LIDAR), and fused at its own time; the changed pose is published with the next
-wheel sample. There is no network here, and any thread may call.
+A wheel sample is decoded, put in order, integrated to odometry, predicts the pose in the map, is fused with the poses
+of SLAM that waited for it, and is published (``take_wheels``). A pose of SLAM is decoded and checked, corrected for the
+calibration's effects on the reference (latency, lever arm of the LIDAR), and fused at its own time; the changed pose is
+published with the next wheel sample. There is no network here, and any thread may call.
 
 Another calibration of the same robot takes over at the next wheel sample. A query asks where the robot was at a time of
-the last seconds. The health is reported from the state: status, rate, age and standard deviations.
+the last seconds. The health reports status, rate, age and standard deviations. No stamp is published twice, since
+listeners such as tf2 take a repeated stamp for repeated data.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
 from omnibench.errors import DataError, OmnibenchError
-from omnibench.live import state as robot_state
-from omnibench.live.fusion import Entry, Fusion, FusionSettings, Outcome, PoseInput
+from omnibench.live.fusion import (
+    Entry,
+    Estimate,
+    Fusion,
+    FusionSettings,
+    Outcome,
+    PoseInput,
+    ReferenceCorrection,
+    Timeline,
+    predict,
+)
 from omnibench.live.health import Counts, FusionHealth, Health, Status, SwapRecord
-from omnibench.live.odometry import Motion
+from omnibench.live.odometry import ExtrapolationMonitor, LiveOdometry, Motion
+from omnibench.live.state import RobotMemory, SavedState
 from omnibench.live.topics import Frames, JointStateDecoder, Update
-from omnibench.live.wheels import WheelSettings, WheelStep
-from omnibench.live.wire import JointState, MessageError, arrival_stamp
+from omnibench.live.wheels import WheelSettings, WheelState, admit, decode
+from omnibench.live.wire import MessageError
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.signals import of_centre
+from omnibench.words import plural
 
+LOG = logging.getLogger("omnibench.live")
+_SECOND: Final = 1e9  # ns
+
+
+class PublishedStamps:
+    """Stamps (ns) that were published, to be told apart from those that come when the robot's clock jumps back.
+
+    remembered: how many of the latest stamps are kept (some 80 bytes each). A stamp older than these can be published
+    twice by chance, after a clock that jumped back so far.
+    """
+
+    def __init__(self, remembered: int = 120_000) -> None:
+        self._remembered = remembered
+        self._order: deque[int] = deque()
+        self._known: set[int] = set()  # the stamps of _order, for looking up
+        self._shift = 1  # ns by which the last repeated stamp was moved; a recording in a loop moves all alike
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def unique(self, stamp: int) -> int:
+        """``stamp``, or the next free one (ns) if it was published already; the result counts as published."""
+        if stamp in self._known:
+            if stamp + self._shift in self._known:
+                longer = count(self._shift + 1)
+                self._shift = next(shift for shift in longer if stamp + shift not in self._known)
+            stamp += self._shift
+        if len(self._order) == self._remembered:
+            self._known.remove(self._order.popleft())
+        self._order.append(stamp)
+        self._known.add(stamp)
+        return stamp
+
+
+_HISTORY = 5.0  # s of odometry that are remembered without fusion; chosen, as FusionSettings.history
+_NO_ESTIMATE = Estimate(np.zeros(3), np.zeros((3, 3)))  # where there is no fusion
 _RATE_WINDOW = 0.9  # s, over which samples are counted at least; below the period of the diagnostics, 1 s
 _BEHIND = 0.1  # s that samples may wait; a node whose samples wait for longer cannot keep up; chosen
-_SECOND = 1e9  # ns
+_SAVE_PERIOD = 0.1  # s between two saved states; chosen: a node that is killed loses no more
+_SAVE_RETRY = 10.0  # s until a state that could not be written is tried again; chosen
+_OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
 
 
-class HealthReporter:
-    """Reports one robot's health. stale_after: s without wheel samples after which the stream counts as stale."""
+class PoseAt(NamedTuple):
+    """A robot's pose at ``stamp`` (ns). odometry: pose (3,) in odom. in_map: pose (3,) and covariance (3, 3)."""
 
-    def __init__(self, stale_after: float) -> None:
-        self._stale_after = stale_after
+    stamp: int
+    odometry: Array
+    in_map: tuple[Array, Array] | None
+
+
+class RobotTracker:
+    """One robot: takes its samples and poses, and answers orders and questions.
+
+    fusion: None for odometry alone. stale_after: s without wheel samples after which the stream counts as stale.
+    memory: where the state outlives the node. ConfigError: the joints that ``wheels`` names are not one for each wheel.
+
+    calibration: the one that runs. counts: everything that was taken, refused or put right. refusals: number of
+    messages that were refused for a reason. flows: flow of an acknowledged replay -> number of the next message that is
+    not in the odometry.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        calibration: Calibration,
+        *,
+        wheels: WheelSettings | None = None,
+        fusion: FusionSettings | None = None,
+        frames: Frames | None = None,
+        stale_after: float = 0.5,
+        memory: RobotMemory | None = None,
+    ) -> None:
+        self.name, self.calibration = name, calibration
+        self.frames = frames or Frames()
+        self.counts, self.refusals, self._last_refusal = Counts(), 0, ""
+        self.flows: dict[int, int] = {}
+        settings = fusion or FusionSettings()
+        self._decoder = JointStateDecoder()
+        self._wheels = WheelState(
+            calibration.robot,
+            wheels or WheelSettings(),
+            calibration.sample_period,
+            self.counts,
+            f"robot {name!r}: wheels",
+        )
+        self._odometry = LiveOdometry(calibration, settings.standstill)
+        self._monitor = ExtrapolationMonitor(name, calibration)
+        self._guessed_angles = _wheel_angle_effects(calibration)
+        self._timeline = Timeline(fusion.history if fusion else _HISTORY)
+        self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
+        self._pose_input = PoseInput(self.frames.map, settings, self.counts)
+        self._reference = ReferenceCorrection(calibration.model)
+        self._stamps = PublishedStamps()
+        self._last_swap: SwapRecord | None = None
+        self._memory = memory
+        # arrival (s, monotonic) of the wheel sample after which the state is to be written; never without a memory
+        self._save_due = -math.inf if memory is not None else math.inf
+        self._arrival: float | None = None  # of the last wheel sample, s, monotonic
+        # s, longest time that a sample had waited when it was taken, in this window and in the last whole one
+        self._behind = self._behind_before = 0.0
         self._counted = (time.monotonic(), 0)  # when samples were counted last, and how many there were
         self._rate = 0.0  # Hz
-        self._behind = 0.0  # s, in the last whole window
+        self._stale_after = stale_after
+        self._state_lock = threading.Lock()  # held while the state is read or changed
+        self._closed = False
+        self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
 
-    def report(self, state: robot_state.RobotState, now: float, waiting_since: float | None = None) -> Health:
-        """The health at ``now`` (s, monotonic). waiting_since: when the oldest message that waits came."""
-        # Rate and waiting time of samples, measured once a window.
-        since, counted = self._counted
-        if now - since >= _RATE_WINDOW:
-            self._rate = (state.counts.samples - counted) / (now - since)
-            self._counted = now, state.counts.samples
-            self._behind, state.behind = state.behind, 0.0
-        if waiting_since is not None:
-            state.behind = max(state.behind, now - waiting_since)
-        age = None if state.arrival is None else now - state.arrival
-        behind = max(self._behind, state.behind)
-        status, message = self._status(state, now, age, behind)
-        covariance = _covariance(state, age if status == "stale" else None)
-        provenance, fusion, fusion_health = state.calibration.provenance, state.fusion, None
-        if fusion is not None:
-            fusion_health = FusionHealth(
-                located=fusion.located,
-                pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
-                last_outcome=fusion.outcome,
-                rejected_in_a_row=fusion.rejected_in_a_row,
+    def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0, *, replayed: bool = False) -> list[Update]:
+        """Take a sensor_msgs/JointState in CDR; its updates, in order.
+
+        Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic. skipped:
+        messages before it that never came, by the sender's numbers. replayed: its stamp counts in any case.
+        """
+        with self._state_lock:
+            if self._closed:
+                return []
+            wheels, odometry, fusion, timeline = self._wheels, self._odometry, self._fusion, self._timeline
+            # 1. Decode the message; what cannot be of this robot's wheels is refused.
+            try:
+                message = self._decoder.decode(payload)
+            except MessageError as error:
+                self.counts.undecodable += 1
+                self._refused(str(error))
+                return []
+            reading = decode(message, arrival, wheels, skipped, replayed=replayed)
+            # 2. Put it in order, and tell how the wheels turned since the last sample.
+            steps = [] if reading is None else admit(reading, wheels)
+            if wheels.refusal:
+                self._refused(wheels.refusal)
+            updates = []
+            for step in steps:
+                # 3. Integrate odometry and its covariance.
+                if self._guessed_angles and step.positions is None:
+                    acts = f"{self.name}: {self._guessed_angles} acts by wheel angles"
+                    LOG.warning("%s, and the messages tell none: they are counted from 0, at a guess", acts)
+                    self._guessed_angles = ""
+                if fusion is not None and fusion.located:
+                    odometry.set_odom_heading(float(fusion.estimate.pose[2] - odometry.pose[2]))
+                motion = odometry.step(step)
+                if self._monitor.seconds is not None:
+                    self._monitor.take(step, odometry.driven)
+                # 4. Predict the pose in the map.
+                if motion.restarted and timeline.entries:
+                    # the clock jumped: the motion counts as if it ended at the new time, and times before it have no
+                    # meaning
+                    timeline.restart(motion.stamp - round(motion.duration * _SECOND))
+                    if fusion is not None:
+                        fusion.restart()
+                estimate = _NO_ESTIMATE
+                if fusion is not None:
+                    estimate = fusion.estimate = predict(fusion.estimate, motion)
+                timeline.append(Entry(motion.stamp, motion, odometry.pose, estimate))
+                # 5. Fuse the poses of SLAM that waited for this time.
+                if fusion is not None:
+                    fusion.take_waiting()
+                # 6. Publish the estimates at the stamp of the sample.
+                updates.append(
+                    Update(
+                        self._stamps.unique(motion.stamp),
+                        odometry.pose,
+                        odometry.covariance,
+                        odometry.twist,
+                        odometry.twist_covariance,
+                        None if fusion is None else fusion.estimate,
+                    )
+                )
+            if updates:
+                self._arrival = arrival
+                if arrival >= self._save_due:
+                    self._save()
+            return updates
+
+    def take_pose(self, payload: bytes, arrival: float, *, replayed: bool = False) -> Outcome | None:
+        """Take a geometry_msgs/PoseWithCovarianceStamped in CDR; None: it is invalid, or there is no fusion."""
+        with self._state_lock:
+            if self._fusion is None:
+                return None
+            try:
+                measurement = self._pose_input.read(payload, arrival, self.calibration, replayed=replayed)
+            except MessageError as error:
+                self._refused(str(error))
+                return None
+            return self._fusion.correct(self._reference.corrected(measurement))
+
+    @property
+    def fusing(self) -> bool:
+        """True if SLAM poses are fused."""
+        return self._fusion is not None
+
+    def health(self, now: float) -> Health:
+        """The robot's health. now: s, monotonic."""
+        with self._state_lock:
+            # Rate and waiting time of samples, measured once a window.
+            since, counted = self._counted
+            if now - since >= _RATE_WINDOW:
+                self._rate = (self.counts.samples - counted) / (now - since)
+                self._counted = now, self.counts.samples
+                self._behind_before, self._behind = self._behind, 0.0
+            waiting_since = self.waiting_since()
+            if waiting_since is not None:
+                self._behind = max(self._behind, now - waiting_since)
+            age = None if self._arrival is None else now - self._arrival
+            behind = max(self._behind_before, self._behind)
+            status, message = self._status(now, age, behind)
+            # Covariance of the fused pose, or of odometry's; it grows in a silence of the wheels.
+            fusion, odometry = self._fusion, self._odometry
+            covariance = odometry.covariance if fusion is None else fusion.estimate.covariance
+            if status == "stale" and age is not None:
+                covariance = covariance + odometry.silence_covariance(age)
+            provenance, fusion_health = self.calibration.provenance, None
+            if fusion is not None:
+                fusion_health = FusionHealth(
+                    located=fusion.located,
+                    pose_age_s=None if fusion.fused_at is None else now - fusion.fused_at,
+                    last_outcome=fusion.outcome,
+                    rejected_in_a_row=fusion.rejected_in_a_row,
+                )
+            return Health(
+                robot=self.name,
+                status=status,
+                message=message,
+                calibration=self.calibration.name,
+                simulated=provenance is not None and provenance.simulated,
+                rate_hz=self._rate,
+                age_s=age,
+                behind_s=behind,
+                last_stamp=self._timeline.newest / _SECOND if self._timeline.entries else None,
+                position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
+                heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
+                fusion=fusion_health,
+                counts=self.counts.as_dict(),
+                last_refusal=self._last_refusal,
+                last_swap=self._last_swap,
+                unfitted_motion_s=self._monitor.seconds,
             )
-        return Health(
-            robot=state.name,
-            status=status,
-            message=message,
-            calibration=state.calibration.name,
-            simulated=provenance is not None and provenance.simulated,
-            rate_hz=self._rate,
-            age_s=age,
-            behind_s=behind,
-            last_stamp=state.timeline.newest / _SECOND if state.timeline.entries else None,
-            position_sigma_m=float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2)),
-            heading_sigma_rad=float(np.sqrt(covariance[2, 2])),
-            fusion=fusion_health,
-            counts=state.counts.as_dict(),
-            last_refusal=state.last_refusal,
-            last_swap=state.last_swap,
-            unfitted_motion_s=state.monitor.seconds,
-        )
 
-    def _status(
-        self, state: robot_state.RobotState, now: float, age: float | None, behind: float
-    ) -> tuple[Status, str]:
+    def _status(self, now: float, age: float | None, behind: float) -> tuple[Status, str]:
         """The status and its reason in words.
 
         age: of the last wheel sample, s; None before the first. behind: longest time that samples waited, s.
         """
+        wheels, fusion = self._wheels, self._fusion
         if age is None:
-            return "waiting", f"no wheel sample yet{f': {state.last_refusal}' if state.last_refusal else ''}"
+            return "waiting", f"no wheel sample yet{f': {self._last_refusal}' if self._last_refusal else ''}"
         if age > self._stale_after + behind:
-            wheels = state.wheel_input
             if wheels.repeats and now - wheels.repeated_at <= self._stale_after + behind:
-                repeated = f"{wheels.repeats} wheel samples have the stamp {state.timeline.newest / _SECOND:.3f} s"
+                repeated = f"{wheels.repeats} wheel samples have the stamp {self._timeline.newest / _SECOND:.3f} s"
                 return "stale", f"stamps stand still: {repeated}; `wheels: {{stamps: arrival}}` takes times of arrival"
             return "stale", f"no wheel sample for {age:.1f} s"
         if behind > _BEHIND:
             return "degraded", f"behind by {behind:.1f} s: samples come faster than they can be taken"
-        if old := state.wheel_input.old_steering:
+        if old := wheels.old_steering:
             return "degraded", f"no steering angles for {old:.1f} s: the last ones are held"
-        fusion = state.fusion
         if fusion is None:
             return "ok", "odometry"
         if not fusion.located:
@@ -116,52 +310,155 @@ class HealthReporter:
             return "degraded", "no pose of SLAM" + ("" if silent is None else f" fused for {silent:.1f} s") + rejected
         return "ok", "odometry and SLAM"
 
+    def pose_at(self, stamp: int | None = None) -> PoseAt:
+        """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
+        with self._state_lock:
+            timeline = self._timeline
+            if not timeline.entries:
+                raise DataError(f"robot {self.name!r} has sent no wheel sample yet")
+            chosen = timeline.newest if stamp is None else stamp
+            odometry = timeline.odometry_at(chosen)
+            if odometry is None:
+                oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
+                raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
+            return PoseAt(chosen, odometry, self._fusion.at(chosen) if self._fusion else None)
 
-def _covariance(state: robot_state.RobotState, silence: float | None) -> Array:
-    """Covariance (3, 3) of the fused pose, or of odometry's; it grows in a silence of the wheels (s)."""
-    odometry, fusion = state.odometry, state.fusion
-    if fusion is None:
-        return odometry.covariance if silence is None else odometry.covariance_after_silence(silence)
-    if silence is None:
-        return fusion.covariance
-    return fusion.covariance + (odometry.covariance_after_silence(silence) - odometry.covariance)
+    def swap(self, calibration: Calibration) -> None:
+        """Continue with another calibration from the next sample on; poses do not jump.
+
+        DataError: it is not this robot's, or cannot be run.
+        """
+        try:
+            with self._state_lock:
+                _check_same_robot(calibration, self.calibration)
+                odometry = self._odometry.continued(calibration)
+                self._reference = ReferenceCorrection(calibration.model, self._reference.start)
+                self.calibration, self._odometry = calibration, odometry
+                self._monitor = ExtrapolationMonitor(self.name, calibration)
+                self._guessed_angles = _wheel_angle_effects(calibration)
+                self.counts.swaps += 1
+                self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
+                self._save()
+        except OmnibenchError as error:
+            self.refuse_swap(str(error), calibration.name)
+            raise DataError(str(error)) from None
+
+    def refuse_swap(self, reason: str, name: str | None = None) -> None:
+        """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
+        with self._state_lock:
+            self.counts.swaps_refused += 1
+            self._last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
+
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """Set the pose (3,) in the map, now. DataError without fusion: odometry itself never jumps."""
+        with self._state_lock:
+            self._required_fusion("set_pose").set_pose(pose, covariance)
+
+    def reset(self) -> None:
+        """Forget the pose in the map; odometry continues. DataError without fusion."""
+        with self._state_lock:
+            self._required_fusion("reset").reset()
+            self._reference.start = None  # the next pose is the first of another run
+
+    def resume(self, saved: SavedState, now: float, wall: float) -> None:
+        """Continue where another node stopped. now, wall: monotonic and unix time, s.
+
+        DataError: the saved state is of a robot with other wheels.
+        """
+        drive, odometry, fusion = self.calibration.robot.drive, self._odometry, self._fusion
+        for angles, wheels, what in (
+            (saved.positions, drive.wheels, "wheel"),
+            (saved.steering, drive.steered, "steered wheel"),
+        ):
+            if angles is not None and len(angles) != len(wheels):
+                which = plural(len(angles), what)
+                raise DataError(f"the state of robot {self.name!r} is of a robot with {which}; remove it")
+        with self._state_lock:
+            positions, steering = (None if row is None else list(row) for row in (saved.positions, saved.steering))
+            self._wheels.resume(saved.stamp, positions, now - (wall - saved.wall), steering)
+            self.flows.update(saved.flows)
+            steered = None if steering is None else np.array(steering)
+            odometry.resume(np.array(saved.pose), np.reshape(saved.covariance, (3, 3)), saved.session_time, steered)
+            if fusion is not None and saved.map_pose is not None and saved.map_covariance is not None:
+                fusion.set_pose(np.array(saved.map_pose), np.reshape(saved.map_covariance, (3, 3)))
+            self._stamps.unique(saved.stamp)
+            motion = Motion(saved.stamp, 0.0, np.zeros(3), self.calibration.integration, 0.0, 0.0)
+            estimate = _NO_ESTIMATE if fusion is None else fusion.estimate
+            self._timeline.append(Entry(saved.stamp, motion, odometry.pose, estimate))
+
+    def count(self, counter: Literal["failures", "overflow"]) -> None:
+        """Count a message on which omnibench itself failed, or one that had no place among those that wait."""
+        with self._state_lock:
+            setattr(self.counts, counter, getattr(self.counts, counter) + 1)
+
+    def record_backlog(self, behind: float) -> None:
+        """Record how long samples had waited when they were taken, s."""
+        with self._state_lock:
+            self._behind = max(self._behind, behind)
+
+    def save(self) -> None:
+        """Write the state, where it outlives the node."""
+        with self._state_lock:
+            self._save()
+
+    def close(self) -> None:
+        """Take no more wheel samples, and write the state."""
+        with self._state_lock:
+            self._closed = True
+            self._save()
+            if self._memory is not None:
+                self._memory.close()
+                self._memory = None
+
+    def _save(self) -> None:
+        """Write the state after the last wheel sample; a disk that refuses is counted and told in health."""
+        last, fusion = self._wheels.last, self._fusion
+        if self._memory is None or last is None or self._arrival is None:
+            return
+        self._save_due = self._arrival + _SAVE_PERIOD
+        fused = fusion.estimate if fusion is not None and fusion.located else (None, None)
+        saved = SavedState.model_construct(  # not validated: reading refuses numbers that cannot be
+            stamp=last.stamp,
+            wall=time.time() - (time.monotonic() - self._arrival),
+            positions=_row(self._wheels.known),
+            steering=_row(last.steering),
+            pose=_row(self._odometry.pose),
+            covariance=_row(self._odometry.covariance),
+            map_pose=_row(fused[0]),
+            map_covariance=_row(fused[1]),
+            session_time=self._odometry.session_time,
+            flows=dict(self.flows),
+        )
+        try:
+            self._memory.save(saved)
+        except OSError as error:  # a full disk must not stop the odometry
+            self.counts.failures += 1
+            self._refused(f"the state could not be written: {error.strerror}")
+            self._save_due += _SAVE_RETRY
+
+    def _refused(self, reason: str) -> None:
+        """Remember why a message was refused."""
+        self.refusals += 1
+        self._last_refusal = reason
+
+    def _required_fusion(self, order: str) -> Fusion:
+        """The fusion that an order needs. order: its name, for messages. DataError: there is no fusion."""
+        if self._fusion is None:
+            raise DataError(f"{order}: robot {self.name!r} runs without fusion, and odom itself never jumps")
+        return self._fusion
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseAt:
-    """A robot's pose at ``stamp`` (ns). odometry: pose (3,) in odom. in_map: pose (3,) and covariance (3, 3)."""
-
-    stamp: int
-    odometry: Array
-    in_map: tuple[Array, Array] | None
+def _row(values: Array | list[float] | None) -> Any:
+    return None if values is None else tuple(np.ravel(values).tolist())
 
 
-_OTHER_ROBOT = 0.5  # share of a row's largest element; chosen: no calibration moves a matrix so far from its design
+def _wheel_angle_effects(calibration: Calibration) -> str:
+    """Names of the calibration's effects that depend on the absolute angles of the wheels."""
+    terms = calibration.model.motion_terms
+    return ", ".join(term.name for term in terms if "wheel_angles" in term.effect.needs)
 
 
-def swap_calibration(state: robot_state.RobotState, calibration: Calibration) -> None:
-    """Continue with another calibration; poses do not jump. DataError: it is not this robot's, or cannot be run."""
-    try:
-        check_same_robot(calibration, state.calibration)
-        odometry = state.odometry.continued(calibration)
-        reference = state.reference.continued(calibration.model)
-    except OmnibenchError as error:
-        record_refused_swap(state, calibration.name, str(error))
-        raise DataError(str(error)) from None
-    state.calibration, state.odometry, state.reference = calibration, odometry, reference
-    state.monitor = robot_state.ExtrapolationMonitor(state.name, calibration)
-    state.guessed_angles = robot_state.wheel_angle_effects(calibration)
-    state.counts.swaps += 1
-    state.last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
-
-
-def record_refused_swap(state: robot_state.RobotState, name: str | None, reason: str) -> None:
-    """Count a calibration that was sent and refused. name: the calibration's, if it could be read."""
-    state.counts.swaps_refused += 1
-    state.last_swap = SwapRecord(accepted=False, name=name, reason=reason, at=time.time())
-
-
-def check_same_robot(calibration: Calibration, running: Calibration) -> None:
+def _check_same_robot(calibration: Calibration, running: Calibration) -> None:
     """DataError: a calibration has other wheels than the running one, or its matrix is far off the design's.
 
     The tracked point may be another one; matrices of the robot's centre are compared.
@@ -176,240 +473,3 @@ def check_same_robot(calibration: Calibration, running: Calibration) -> None:
                 f"row {int(off.argmax()) + 1} of the matrix is {off.max():.0%} off the design of robot "
                 f"{robot.name!r}; is it another robot's, or in other units?"
             )
-
-
-LOG = logging.getLogger("omnibench.live")
-
-
-class RobotTracker:
-    """One robot: takes its samples and poses, and answers orders and questions.
-
-    fusion: None for odometry alone. stale_after: s without wheel samples after which the stream counts as stale.
-    memory: where the state outlives the node.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        calibration: Calibration,
-        *,
-        wheels: WheelSettings | None = None,
-        fusion: FusionSettings | None = None,
-        frames: Frames | None = None,
-        stale_after: float = 0.5,
-        memory: robot_state.RobotMemory | None = None,
-    ) -> None:
-        self.name = name
-        self.frames = frames or Frames()
-        self._state = robot_state.new_state(name, calibration, wheels or WheelSettings(), fusion)
-        self._decoder = JointStateDecoder()
-        self._by_arrival = wheels is not None and wheels.stamps == "arrival"
-        self._pose_input = PoseInput(self.frames.map, fusion or FusionSettings(), self.counts)
-        self._state_writer = robot_state.StateWriter(memory)
-        self._health = HealthReporter(stale_after)
-        self._state_lock = threading.Lock()  # held while the state is read or changed
-        self._closed = False
-        self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
-
-    @property
-    def refusals(self) -> int:
-        """Number of messages that were refused for a reason."""
-        return self._state.refusals
-
-    def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0, *, replayed: bool = False) -> list[Update]:
-        """Take a sensor_msgs/JointState in CDR; its updates, in order.
-
-        Mostly there is one; none while a sample is refused or has to be confirmed. arrival: s, monotonic. skipped:
-        messages before it that never came, by the sender's numbers. replayed: its stamp counts in any case.
-        """
-        with self._state_lock:
-            message = self._decode(payload)
-            if message is not None and self._by_arrival and not replayed:
-                message = replace(message, stamp=arrival_stamp(arrival))
-            updates = []
-            for step in self._order_and_repair(message, arrival, skipped):
-                motion = self._integrate(step)
-                self._fuse(motion)
-                updates.append(self._update(motion.stamp))
-            self._state_writer.save_if_due(self._state)
-            return updates
-
-    def take_pose(self, payload: bytes, arrival: float, *, replayed: bool = False) -> Outcome | None:
-        """Take a geometry_msgs/PoseWithCovarianceStamped in CDR; None: it is invalid, or there is no fusion."""
-        with self._state_lock:
-            fusion = self._state.fusion
-            if fusion is None:
-                return None
-            try:
-                measurement = self._pose_input.read(payload, arrival, self.calibration, replayed=replayed)
-            except MessageError as error:
-                self._state.refused(str(error))
-                return None
-            return fusion.correct(self._state.reference.corrected(measurement))
-
-    def _decode(self, payload: bytes) -> JointState | None:
-        """Step 1: the wheel message in a payload; None if it is not one, or the tracker is closed."""
-        if self._closed:
-            return None
-        try:
-            return self._decoder.decode(payload)
-        except MessageError as error:
-            self.counts.undecodable += 1
-            self._state.refused(str(error))
-            return None
-
-    def _order_and_repair(self, message: JointState | None, arrival: float, skipped: int) -> list[WheelStep]:
-        """Step 2: how the wheels turned since the last sample; late, doubled and impossible samples are refused."""
-        if message is None:
-            return []
-        state = self._state
-        state.wheel_input.last_refusal = ""
-        steps = state.wheel_input.take(message, arrival, skipped)
-        if state.wheel_input.last_refusal:
-            state.refused(state.wheel_input.last_refusal)
-        if steps:
-            state.arrival = arrival
-        return steps
-
-    def _integrate(self, step: WheelStep) -> Motion:
-        """Step 3: odometry and its covariance after the step; the motion that the step made."""
-        state = self._state
-        if self._state.guessed_angles and step.positions is None:
-            LOG.warning(
-                "%s: %s acts by wheel angles, and the messages tell none: they are counted from 0, at a guess",
-                *(self.name, self._state.guessed_angles),
-            )
-            self._state.guessed_angles = ""
-        if state.fusion is not None and state.fusion.located:
-            state.odometry.set_odom_heading(float(state.fusion.pose[2] - state.odometry.pose[2]))
-        motion = state.odometry.step(step)
-        state.monitor.take(step, state.odometry.driven)
-        return motion
-
-    def _fuse(self, motion: Motion) -> None:
-        """Step 4: the motion joins the timeline, and poses that were waiting for its time are fused."""
-        state = self._state
-        if motion.restarted and state.timeline.entries:
-            # the clock jumped: the motion counts as if it ended at the new time, and times before it have no meaning
-            state.timeline.restart(motion.stamp - round(motion.duration * _SECOND))
-            if state.fusion is not None:
-                state.fusion.restart()
-        self._add_to_timeline(motion)
-
-    def _update(self, stamp: int) -> Update:
-        """Step 5: the estimates at the stamp of the sample (ns), as they are published."""
-        odometry, fusion = self._state.odometry, self._state.fusion
-        return Update(
-            self._state.stamps.unique(stamp),
-            odometry.pose,
-            odometry.covariance,
-            odometry.twist,
-            odometry.twist_covariance,
-            None if fusion is None else (fusion.pose, fusion.covariance),
-        )
-
-    def _add_to_timeline(self, motion: Motion) -> None:
-        timeline, fusion, pose = self._state.timeline, self._state.fusion, self._state.odometry.pose
-        if fusion is None:
-            timeline.append(Entry(motion.stamp, motion, pose, pose, np.zeros((3, 3))))
-            return
-        timeline.append(Entry(motion.stamp, motion, pose, *fusion.predict(motion)))
-        fusion.take_waiting()
-
-    @property
-    def calibration(self) -> Calibration:
-        """The calibration that runs."""
-        return self._state.calibration
-
-    @property
-    def counts(self) -> Counts:
-        """Everything that was taken, refused or put right, counted."""
-        return self._state.counts
-
-    @property
-    def fusing(self) -> bool:
-        """True if SLAM poses are fused."""
-        return self._state.fusion is not None
-
-    @property
-    def flows(self) -> dict[int, int]:
-        """Flow of an acknowledged replay -> number of the next message that is not in the odometry."""
-        return self._state.flows
-
-    def health(self, now: float) -> Health:
-        """The robot's health. now: s, monotonic."""
-        with self._state_lock:
-            return self._health.report(self._state, now, self.waiting_since())
-
-    def pose_at(self, stamp: int | None = None) -> PoseAt:
-        """The pose at a time (ns; default: of the last sample). DataError: nothing is remembered of that time."""
-        with self._state_lock:
-            timeline, fusion = self._state.timeline, self._state.fusion
-            if not timeline.entries:
-                raise DataError(f"robot {self.name!r} has sent no wheel sample yet")
-            chosen = timeline.newest if stamp is None else stamp
-            odometry = timeline.odometry_at(chosen)
-            if odometry is None:
-                oldest, newest = timeline.oldest / _SECOND, timeline.newest / _SECOND
-                raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
-            return PoseAt(chosen, odometry, fusion.at(chosen) if fusion else None)
-
-    def swap(self, calibration: Calibration) -> None:
-        """Continue with another calibration from the next sample on. DataError: it is not this robot's."""
-        with self._state_lock:
-            swap_calibration(self._state, calibration)
-            self._state_writer.save(self._state)
-
-    def refuse_swap(self, reason: str) -> None:
-        """Count a calibration that was sent and cannot be read."""
-        with self._state_lock:
-            record_refused_swap(self._state, None, reason)
-
-    def set_pose(self, pose: Array, covariance: Array) -> None:
-        """Set the pose (3,) in the map, now. DataError without fusion: odometry itself never jumps."""
-        with self._state_lock:
-            self._required_fusion("set_pose").set_pose(pose, covariance)
-
-    def reset(self) -> None:
-        """Forget the pose in the map; odometry continues. DataError without fusion."""
-        with self._state_lock:
-            self._required_fusion("reset").reset()
-            self._state.reference.restart()
-
-    def resume(self, saved: robot_state.SavedState, now: float, wall: float) -> None:
-        """Continue where another node stopped. now, wall: monotonic and unix time, s."""
-        with self._state_lock:
-            self._add_to_timeline(robot_state.resume_state(self._state, saved, now, wall))
-
-    def count_failure(self) -> None:
-        """Count a message on which omnibench itself failed."""
-        with self._state_lock:
-            self.counts.failures += 1
-
-    def record_backlog(self, behind: float, unpublished: int) -> None:
-        """Record how long samples had waited when they were taken, s, and how many updates were not published."""
-        with self._state_lock:
-            self._state.behind = max(self._state.behind, behind)
-            self.counts.unpublished += unpublished
-
-    def save(self) -> None:
-        """Write the state, where it outlives the node."""
-        with self._state_lock:
-            self._state_writer.save(self._state)
-
-    def count_overflow(self) -> None:
-        """Count a message that was not taken, because too many were waiting."""
-        with self._state_lock:
-            self.counts.overflow += 1
-
-    def close(self) -> None:
-        """Take no more wheel samples, and write the state."""
-        with self._state_lock:
-            self._closed = True
-            self._state_writer.close(self._state)
-
-    def _required_fusion(self, order: str) -> Fusion:
-        """The fusion that an order needs. order: its name, for messages. DataError: there is no fusion."""
-        if self._state.fusion is None:
-            raise DataError(f"{order}: robot {self.name!r} runs without fusion, and odom itself never jumps")
-        return self._state.fusion

@@ -16,9 +16,8 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -58,14 +57,6 @@ def _is_numbered(attachment: bytes) -> bool:
     return len(attachment) in (_HEAD.size, _HEAD.size + _FLOW.size) and attachment[16] == _IDENTITY_LENGTH
 
 
-@dataclass(slots=True)
-class _Numbers:
-    """Numbers of one publisher: the highest that came, and those below it that did not, in increasing order."""
-
-    highest: int
-    missing: OrderedDict[int, None] = field(default_factory=OrderedDict)
-
-
 class MissedMessages:
     """Counts the messages that were published and did not come, by the gaps in each publisher's numbers.
 
@@ -75,7 +66,7 @@ class MissedMessages:
 
     def __init__(self) -> None:
         self.count = 0
-        self._publishers: dict[bytes, _Numbers] = {}
+        self._publishers: dict[bytes, tuple[int, set[int]]] = {}  # the highest number to come, those missing below it
 
     def take(self, attachment: zenoh.ZBytes | bytes | None) -> int | None:
         """The number of messages right before a new one that were published and have not come.
@@ -86,26 +77,22 @@ class MissedMessages:
         if not _is_numbered(content):
             return 0
         number, _, _, publisher = _HEAD.unpack_from(content)
-        numbers = self._publishers.get(publisher)
-        if numbers is None:
-            self._publishers[publisher] = _Numbers(number)
+        highest, missing = self._publishers.get(publisher, (number - 1, set()))
+        if number > highest:
+            gap = number - highest - 1
+            self.count += gap
+            missing.update(range(max(highest + 1, number - _MOST_MISSING), number))
+            if len(missing) > _MOST_MISSING:
+                missing = {each for each in missing if each >= number - _MOST_MISSING}
+            self._publishers[publisher] = number, missing
             if len(self._publishers) > _MOST_PUBLISHERS:
                 del self._publishers[next(iter(self._publishers))]
-            return 0
-        gap = number - numbers.highest - 1
-        if gap >= 0:
-            numbers.highest = number
-            if gap:
-                self.count += gap
-                numbers.missing.update(dict.fromkeys(range(number - min(gap, _MOST_MISSING), number)))
-                while len(numbers.missing) > _MOST_MISSING:
-                    numbers.missing.popitem(last=False)
             return gap
-        if number not in numbers.missing:
-            return 0 if len(content) == _HEAD.size else None  # only what is acknowledged is ever sent again
-        del numbers.missing[number]
-        self.count -= 1
-        return 0
+        if number in missing:
+            missing.remove(number)
+            self.count -= 1
+            return 0
+        return 0 if len(content) == _HEAD.size else None  # only what is acknowledged is ever sent again
 
 
 STORE: Final = get_typestore(Stores.ROS2_JAZZY)
@@ -121,6 +108,64 @@ class MessageError(DataError):
     """A message that is not of its topic's type, or whose values are impossible."""
 
 
+def _make(name: str, *fields: Any) -> Any:
+    """A ROS message of a type, by its fields in order."""
+    return STORE.types[name](*fields)
+
+
+def _header(stamp: int, frame: str) -> Any:
+    return _make("std_msgs/msg/Header", _make("builtin_interfaces/msg/Time", *divmod(stamp, _SECOND)), frame)
+
+
+def _stamp_and_frame(header: Any) -> tuple[int, str]:
+    if header.stamp.nanosec >= _SECOND:
+        raise MessageError(f"its stamp has {header.stamp.nanosec} ns within a second")
+    return int(header.stamp.sec) * _SECOND + int(header.stamp.nanosec), header.frame_id
+
+
+def _vector(kind: str, x: float, y: float, z: float) -> Any:
+    return _make(f"geometry_msgs/msg/{kind}", float(x), float(y), float(z))
+
+
+def _quaternion(heading: float) -> Any:
+    return _make("geometry_msgs/msg/Quaternion", 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+
+
+def _heading(quaternion: Any) -> float:
+    """The yaw of a quaternion, rad. MessageError: its length is not 1, or it tilts by more than _LARGEST_TILT."""
+    x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not abs(length - 1) < 0.01:
+        raise MessageError(f"its quaternion has length {length:.3g}, expected 1")
+    upright = 1 - 2 * (x * x + y * y) / length**2
+    if not upright > math.cos(_LARGEST_TILT):
+        raise MessageError(f"its pose is tilted by {math.degrees(math.acos(max(upright, -1.0))):.0f} degrees")
+    return math.atan2(2 * (w * z + x * y), length**2 - 2 * (y * y + z * z))
+
+
+def _with_covariance(kind: str, content: Any, covariance: Array) -> Any:
+    """PoseWithCovariance or TwistWithCovariance."""
+    full = _OUT_OF_PLANE.copy()
+    full[PLANAR_INDICES] = np.ravel(covariance)
+    return _make(f"geometry_msgs/msg/{kind}WithCovariance", content, full)
+
+
+def _planar_covariance(message: Any) -> Array:
+    return np.asarray(message.covariance[PLANAR_INDICES], dtype=float).reshape(3, 3)
+
+
+def _pose_with_covariance(pose: Array, covariance: Array) -> Any:
+    x, y, heading = pose.tolist()
+    position = _vector("Point", x, y, 0.0)
+    return _with_covariance("Pose", _make("geometry_msgs/msg/Pose", position, _quaternion(heading)), covariance)
+
+
+def _planar_pose(message: Any) -> tuple[Array, Array]:
+    """Pose (3,) and covariance (3, 3) of a PoseWithCovariance."""
+    position, heading = message.pose.position, _heading(message.pose.orientation)
+    return np.array([position.x, position.y, heading]), _planar_covariance(message)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
     """sensor_msgs/JointState. names (N,); positions (N,) rad and velocities (N,) rad/s, None if not sent."""
@@ -131,6 +176,24 @@ class JointState:
     velocities: Array | None = None
     frame: str = ""
 
+    def to_ros(self) -> Any:
+        positions, velocities = (
+            np.zeros(0) if values is None else np.ascontiguousarray(values, dtype=float)
+            for values in (self.positions, self.velocities)
+        )
+        header = _header(self.stamp, self.frame)
+        return _make("sensor_msgs/msg/JointState", header, list(self.names), positions, velocities, np.zeros(0))
+
+    @classmethod
+    def from_ros(cls, content: Any) -> JointState:
+        names = tuple(content.name)
+        for what, values in (("positions", content.position), ("velocities", content.velocity)):
+            if len(values) not in (0, len(names)):
+                raise MessageError(f"it has {len(names)} names and {len(values)} {what}")
+        stamp, frame = _stamp_and_frame(content.header)
+        positions, velocities = (each if len(each) else None for each in (content.position, content.velocity))
+        return cls(stamp, names, positions, velocities, frame)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
@@ -140,6 +203,14 @@ class PoseEstimate:
     frame: str
     pose: Array
     covariance: Array
+
+    def to_ros(self) -> Any:
+        pose = _pose_with_covariance(self.pose, self.covariance)
+        return _make("geometry_msgs/msg/PoseWithCovarianceStamped", _header(self.stamp, self.frame), pose)
+
+    @classmethod
+    def from_ros(cls, content: Any) -> PoseEstimate:
+        return cls(*_stamp_and_frame(content.header), *_planar_pose(content.pose))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,6 +230,34 @@ class Odometry:
         """The stamp in s."""
         return self.stamp / _SECOND
 
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation of the position along an axis, m: the root of the mean of x's and y's variances."""
+        return math.sqrt(max(float(self.pose_covariance[0, 0] + self.pose_covariance[1, 1]) / 2, 0.0))
+
+    @property
+    def heading_sigma(self) -> float:
+        """Standard deviation of the heading, rad."""
+        return math.sqrt(max(float(self.pose_covariance[2, 2]), 0.0))
+
+    def to_ros(self) -> Any:
+        vx, vy, w = self.twist.tolist()
+        twist = _make("geometry_msgs/msg/Twist", _vector("Vector3", vx, vy, 0.0), _vector("Vector3", 0.0, 0.0, w))
+        return _make(
+            "nav_msgs/msg/Odometry",
+            _header(self.stamp, self.frame),
+            self.child_frame,
+            _pose_with_covariance(self.pose, self.pose_covariance),
+            _with_covariance("Twist", twist, self.twist_covariance),
+        )
+
+    @classmethod
+    def from_ros(cls, content: Any) -> Odometry:
+        head, pose = _stamp_and_frame(content.header), _planar_pose(content.pose)
+        twist = content.twist.twist
+        velocities = np.array([twist.linear.x, twist.linear.y, twist.angular.z])
+        return cls(*head, content.child_frame_id, *pose, velocities, _planar_covariance(content.twist))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transform:
@@ -168,6 +267,17 @@ class Transform:
     frame: str
     child_frame: str
     pose: Array
+
+    def to_ros(self) -> Any:
+        x, y, heading = self.pose.tolist()
+        transform = _make("geometry_msgs/msg/Transform", _vector("Vector3", x, y, 0.0), _quaternion(heading))
+        header = _header(self.stamp, self.frame)
+        return _make("geometry_msgs/msg/TransformStamped", header, self.child_frame, transform)
+
+    @classmethod
+    def from_ros(cls, content: Any) -> Transform:
+        moved, heading = content.transform.translation, _heading(content.transform.rotation)
+        return cls(*_stamp_and_frame(content.header), content.child_frame_id, np.array([moved.x, moved.y, heading]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +290,16 @@ class Diagnostic:
     hardware: str
     values: tuple[tuple[str, str], ...]
 
+    def to_ros(self) -> Any:
+        values = [_make("diagnostic_msgs/msg/KeyValue", *pair) for pair in self.values]
+        texts = self.name, self.message, self.hardware
+        return _make("diagnostic_msgs/msg/DiagnosticStatus", self.level, *texts, values)
+
+    @classmethod
+    def from_ros(cls, content: Any) -> Diagnostic:
+        values = tuple((pair.key, pair.value) for pair in content.values)
+        return cls(content.name, int(content.level), content.message, content.hardware_id, values)
+
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
@@ -187,6 +307,15 @@ class Diagnostics:
 
     stamp: int
     statuses: tuple[Diagnostic, ...]
+
+    def to_ros(self) -> Any:
+        statuses = [status.to_ros() for status in self.statuses]
+        return _make("diagnostic_msgs/msg/DiagnosticArray", _header(self.stamp, ""), statuses)
+
+    @classmethod
+    def from_ros(cls, content: Any) -> Diagnostics:
+        stamp, _ = _stamp_and_frame(content.header)
+        return cls(stamp, tuple(Diagnostic.from_ros(status) for status in content.status))
 
 
 _CLOCKS_APART: Final = time.time_ns() - time.monotonic_ns()  # ns, once: stamps by arrival never jump
@@ -237,189 +366,14 @@ class MessageType(Generic[M]):
             raise MessageError(f"not a {self.name} of {len(payload)} bytes: {error}") from None
 
 
-def _ros(name: str) -> Any:
-    return STORE.types[name]
-
-
-_Header, _Time = _ros("std_msgs/msg/Header"), _ros("builtin_interfaces/msg/Time")
-_Point, _Vector, _Quaternion = (_ros(f"geometry_msgs/msg/{name}") for name in ("Point", "Vector3", "Quaternion"))
-_Pose, _PoseCovariance = _ros("geometry_msgs/msg/Pose"), _ros("geometry_msgs/msg/PoseWithCovariance")
-_Twist, _TwistCovariance = _ros("geometry_msgs/msg/Twist"), _ros("geometry_msgs/msg/TwistWithCovariance")
-_Transform, _TransformStamped = _ros("geometry_msgs/msg/Transform"), _ros("geometry_msgs/msg/TransformStamped")
-_Status, _KeyValue = _ros("diagnostic_msgs/msg/DiagnosticStatus"), _ros("diagnostic_msgs/msg/KeyValue")
-_NOTHING = np.zeros(0)
-
-
-def _header(stamp: int, frame: str) -> Any:
-    return _Header(_Time(stamp // _SECOND, stamp % _SECOND), frame)
-
-
-def _stamp(header: Any) -> int:
-    if header.stamp.nanosec >= _SECOND:
-        raise MessageError(f"its stamp has {header.stamp.nanosec} ns within a second")
-    return int(header.stamp.sec) * _SECOND + int(header.stamp.nanosec)
-
-
-def _quaternion(heading: float) -> Any:
-    return _Quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
-
-
-def _heading(quaternion: Any) -> float:
-    """The yaw of a quaternion, rad. MessageError: its length is not 1, or it tilts by more than _LARGEST_TILT."""
-    x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(length - 1) < 0.01:
-        raise MessageError(f"its quaternion has length {length:.3g}, expected 1")
-    upright = 1 - 2 * (x * x + y * y) / length**2
-    if not upright > math.cos(_LARGEST_TILT):
-        raise MessageError(f"its pose is tilted by {math.degrees(math.acos(max(upright, -1.0))):.0f} degrees")
-    return math.atan2(2 * (w * z + x * y), length**2 - 2 * (y * y + z * z))
-
-
-def _covariance_36(covariance: Array) -> Array:
-    full = _OUT_OF_PLANE.copy()
-    full[PLANAR_INDICES] = np.ravel(covariance)
-    return full
-
-
-def _plane_pose(pose: Any) -> Array:
-    return np.array([pose.position.x, pose.position.y, _heading(pose.orientation)])
-
-
-def _plane_covariance(covariance: Array) -> Array:
-    return np.asarray(covariance[PLANAR_INDICES], dtype=float).reshape(3, 3)
-
-
-def _ros_pose(pose: Array) -> Any:
-    x, y, heading = pose.tolist()
-    return _Pose(_Point(x, y, 0.0), _quaternion(heading))
-
-
-def _joint_state_to_ros(message: JointState) -> Any:
-    positions = _NOTHING if message.positions is None else np.ascontiguousarray(message.positions, dtype=float)
-    velocities = _NOTHING if message.velocities is None else np.ascontiguousarray(message.velocities, dtype=float)
-    return _ros("sensor_msgs/msg/JointState")(
-        _header(message.stamp, message.frame), list(message.names), positions, velocities, _NOTHING
-    )
-
-
-def _joint_state_from_ros(content: Any) -> JointState:
-    names = tuple(content.name)
-    for what, values in (("positions", content.position), ("velocities", content.velocity)):
-        if len(values) not in (0, len(names)):
-            raise MessageError(f"it has {len(names)} names and {len(values)} {what}")
-    return JointState(
-        _stamp(content.header),
-        names,
-        content.position if len(content.position) else None,
-        content.velocity if len(content.velocity) else None,
-        content.header.frame_id,
-    )
-
-
-def _pose_to_ros(message: PoseEstimate) -> Any:
-    return _ros("geometry_msgs/msg/PoseWithCovarianceStamped")(
-        _header(message.stamp, message.frame),
-        _PoseCovariance(_ros_pose(message.pose), _covariance_36(message.covariance)),
-    )
-
-
-def _pose_from_ros(content: Any) -> PoseEstimate:
-    return PoseEstimate(
-        _stamp(content.header),
-        content.header.frame_id,
-        _plane_pose(content.pose.pose),
-        _plane_covariance(content.pose.covariance),
-    )
-
-
-def _odometry_to_ros(message: Odometry) -> Any:
-    vx, vy, w = message.twist.tolist()
-    return _ros("nav_msgs/msg/Odometry")(
-        _header(message.stamp, message.frame),
-        message.child_frame,
-        _PoseCovariance(_ros_pose(message.pose), _covariance_36(message.pose_covariance)),
-        _TwistCovariance(_Twist(_Vector(vx, vy, 0.0), _Vector(0.0, 0.0, w)), _covariance_36(message.twist_covariance)),
-    )
-
-
-def _odometry_from_ros(content: Any) -> Odometry:
-    twist = content.twist.twist
-    return Odometry(
-        _stamp(content.header),
-        content.header.frame_id,
-        content.child_frame_id,
-        _plane_pose(content.pose.pose),
-        _plane_covariance(content.pose.covariance),
-        np.array([twist.linear.x, twist.linear.y, twist.angular.z]),
-        _plane_covariance(content.twist.covariance),
-    )
-
-
-def _transforms_to_ros(transforms: Sequence[Transform]) -> Any:
-    return _ros("tf2_msgs/msg/TFMessage")(
-        [
-            _TransformStamped(
-                _header(transform.stamp, transform.frame),
-                transform.child_frame,
-                _Transform(
-                    _Vector(float(transform.pose[0]), float(transform.pose[1]), 0.0),
-                    _quaternion(float(transform.pose[2])),
-                ),
-            )
-            for transform in transforms
-        ]
-    )
-
-
-def _transforms_from_ros(content: Any) -> tuple[Transform, ...]:
-    return tuple(
-        Transform(
-            _stamp(item.header),
-            item.header.frame_id,
-            item.child_frame_id,
-            np.array(
-                [
-                    item.transform.translation.x,
-                    item.transform.translation.y,
-                    _heading(item.transform.rotation),
-                ]
-            ),
-        )
-        for item in content.transforms
-    )
-
-
-def _diagnostics_to_ros(message: Diagnostics) -> Any:
-    statuses = [
-        _Status(
-            status.level, status.name, status.message, status.hardware, [_KeyValue(*pair) for pair in status.values]
-        )
-        for status in message.statuses
-    ]
-    return _ros("diagnostic_msgs/msg/DiagnosticArray")(_header(message.stamp, ""), statuses)
-
-
-def _diagnostics_from_ros(content: Any) -> Diagnostics:
-    statuses = tuple(
-        Diagnostic(
-            status.name,
-            int(status.level),
-            status.message,
-            status.hardware_id,
-            tuple((pair.key, pair.value) for pair in status.values),
-        )
-        for status in content.status
-    )
-    return Diagnostics(_stamp(content.header), statuses)
-
-
-JOINT_STATE: Final = MessageType[JointState]("sensor_msgs/msg/JointState", _joint_state_to_ros, _joint_state_from_ros)
-POSE_ESTIMATE: Final = MessageType[PoseEstimate](
-    "geometry_msgs/msg/PoseWithCovarianceStamped", _pose_to_ros, _pose_from_ros
+JOINT_STATE: Final = MessageType("sensor_msgs/msg/JointState", JointState.to_ros, JointState.from_ros)
+POSE_ESTIMATE: Final = MessageType(
+    "geometry_msgs/msg/PoseWithCovarianceStamped", PoseEstimate.to_ros, PoseEstimate.from_ros
 )
-ODOMETRY: Final = MessageType[Odometry]("nav_msgs/msg/Odometry", _odometry_to_ros, _odometry_from_ros)
-TRANSFORMS: Final = MessageType[Sequence[Transform]]("tf2_msgs/msg/TFMessage", _transforms_to_ros, _transforms_from_ros)
-DIAGNOSTICS: Final = MessageType[Diagnostics](
-    "diagnostic_msgs/msg/DiagnosticArray", _diagnostics_to_ros, _diagnostics_from_ros
+ODOMETRY: Final = MessageType("nav_msgs/msg/Odometry", Odometry.to_ros, Odometry.from_ros)
+TRANSFORMS: Final = MessageType[Sequence[Transform]](
+    "tf2_msgs/msg/TFMessage",
+    lambda transforms: _make("tf2_msgs/msg/TFMessage", [each.to_ros() for each in transforms]),
+    lambda content: tuple(Transform.from_ros(each) for each in content.transforms),
 )
+DIAGNOSTICS: Final = MessageType("diagnostic_msgs/msg/DiagnosticArray", Diagnostics.to_ros, Diagnostics.from_ros)

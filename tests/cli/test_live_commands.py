@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,25 @@ def test_a_recording_goes_out_and_a_calibration_is_swapped_in(command: InProcess
 def test_a_node_ends_with_a_sentence_that_says_how_to_start_it_again(command: InProcess, workplace: Path) -> None:
     ended = succeeded(command("live", workplace / "node.yaml", "--seconds", "0"))
     assert re.search(r"^node \w+ has ended, .*:\n  omnibench live ", ended.stderr, re.MULTILINE)
+
+
+def test_a_layout_for_foxglove_is_written_and_replaces_nothing(
+    command: InProcess, workplace: Path, tmp_path: Path
+) -> None:
+    typed = ("live", workplace / "node.yaml", "--seconds", "0", "--layout", tmp_path / "layout.json")
+    succeeded(command(*typed))
+    assert "3D!apr" in json.loads((tmp_path / "layout.json").read_text())["configById"]
+    assert_refused(command(*typed), "layout.json", "is there already")
+
+
+def test_rerun_is_optional_and_takes_its_own_files(
+    command: InProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)  # what an absent package looks like
+    refused = command("live", write_node(tmp_path, "apr"), "--rerun")
+    assert_refused(refused, 'pip install "omnibench[rerun]"')
+    assert refused.returncode == 2
+    assert_refused(command("live", write_node(tmp_path, "apr", rerun="drive.mcap")), "rerun", "ends in .rrd")
 
 
 @pytest.mark.slow

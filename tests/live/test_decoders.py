@@ -30,7 +30,6 @@ from omnibench.live.topics import (
     Output,
     Profile,
     Publisher,
-    TransformsEncoder,
     Update,
     filtered_odometry,
     odometry,
@@ -45,7 +44,6 @@ from omnibench.live.wire import (
     MessageError,
     MissedMessages,
     Odometry,
-    Transform,
     flow_of,
     packed,
 )
@@ -321,14 +319,6 @@ def test_odometry_of_fixed_frames_is_encoded_as_rosbags_does(frame: str, child: 
     for stamp, *numbers in contents:
         message = Odometry(stamp, frame, child, *numbers)
         assert encoder.encode(message) == ODOMETRY.encode(message)
-
-
-@given(st.lists(st.tuples(NAMES, NAMES), min_size=1, max_size=3), st.data())
-def test_transforms_of_fixed_frames_are_encoded_as_rosbags_does(frames: list[Any], data: st.DataObject) -> None:
-    encoder = TransformsEncoder(frames)
-    for _ in range(2):
-        transforms = [Transform(data.draw(STAMPS), *pair, data.draw(vector())) for pair in frames]
-        assert encoder.encode(transforms) == TRANSFORMS.encode(transforms)
 
 
 @st.composite

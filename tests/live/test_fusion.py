@@ -30,10 +30,9 @@ def test_the_predicted_covariance_is_that_of_finite_differences(moved: list[floa
             for shift in shifts
         ]
     )
-    pose_filter = pose_fusion.PoseFilter(pose, COVARIANCE)
-    pose_filter.predict(step)
+    predicted = pose_fusion.predict(pose_fusion.Estimate(pose, COVARIANCE), step)
     expected = jacobian @ COVARIANCE @ jacobian.T + VARIANCE * np.eye(3)
-    np.testing.assert_allclose(pose_filter.covariance, expected, atol=1e-8)
+    np.testing.assert_allclose(predicted.covariance, expected, atol=1e-8)
 
 
 def test_the_normalised_error_of_sparse_poses_is_that_of_three_degrees_of_freedom() -> None:
@@ -44,15 +43,14 @@ def test_the_normalised_error_of_sparse_poses_is_that_of_three_degrees_of_freedo
     for _ in range(150):
         true = rng.uniform(-3, 3, 3)
         moved = np.array([0.06, rng.uniform(-0.03, 0.03), rng.uniform(-0.02, 0.02)])
-        pose_filter = pose_fusion.PoseFilter(true + rng.multivariate_normal(np.zeros(3), slam), slam)
+        estimate = pose_fusion.Estimate(true + rng.multivariate_normal(np.zeros(3), slam), slam)
         for _ in range(2):
             for _ in range(50):  # 3 m from pose to pose
                 step = motion(0, moved, variance=1e-6)
                 true = advance(true, moved, "arc") + 1e-3 * rng.standard_normal(3)
-                pose_filter.predict(step)
-            error = pose_fusion.innovation_of(true.copy(), pose_filter.pose)
-            normalised.append(error @ np.linalg.solve(pose_filter.covariance, error))
-            pose_filter.correct(true + rng.multivariate_normal(np.zeros(3), slam), slam)
+                estimate = pose_fusion.predict(estimate, step)
+            normalised.append(pose_fusion.squared_distance(true, *estimate))
+            estimate = pose_fusion.correct(estimate, true + rng.multivariate_normal(np.zeros(3), slam), slam)
     assert np.mean(normalised) == pytest.approx(3.0, abs=0.5)
 
 
@@ -75,8 +73,8 @@ class Robot:
         return self
 
     def _append(self, moved: Motion) -> None:
-        pose, covariance = self.fusion.predict(moved)
-        self.timeline.append(pose_fusion.Entry(moved.stamp, moved, self.truth[-1], pose, covariance))
+        estimate = self.fusion.estimate = pose_fusion.predict(self.fusion.estimate, moved)
+        self.timeline.append(pose_fusion.Entry(moved.stamp, moved, self.truth[-1], estimate))
         self.fusion.take_waiting()
 
     def at(self, time: float) -> np.ndarray:
@@ -108,17 +106,17 @@ def test_poses_may_come_late_and_in_any_order_and_the_result_is_the_same(data: s
     for index in (0, *order):
         late.see(times[index], errors[index])
     assert punctual.counts.poses == late.counts.poses == len(times)
-    np.testing.assert_allclose(late.fusion.pose, punctual.fusion.pose, atol=1e-12)
-    np.testing.assert_allclose(late.fusion.covariance, punctual.fusion.covariance, atol=1e-15)
+    np.testing.assert_allclose(late.fusion.estimate.pose, punctual.fusion.estimate.pose, atol=1e-12)
+    np.testing.assert_allclose(late.fusion.estimate.covariance, punctual.fusion.estimate.covariance, atol=1e-15)
 
 
 def test_a_pose_older_than_the_history_is_counted_and_changes_nothing() -> None:
     robot = Robot(history=2.0).drive(1000)
     assert robot.see(8.0) == "located"
-    before = robot.fusion.pose.copy()
+    before = robot.fusion.estimate.pose.copy()
     assert robot.see(0.15) == "too late"
     assert robot.counts.pose_too_late == 1
-    np.testing.assert_array_equal(robot.fusion.pose, before)
+    np.testing.assert_array_equal(robot.fusion.estimate.pose, before)
     assert robot.see(8.01) == "fused"
 
 
@@ -161,14 +159,14 @@ def test_four_poses_that_agree_are_believed(seen: list[tuple[float, float, float
     robot.see(0.1)
     assert [robot.see(time, (x, y, 0)) for time, x, y in seen] == outcomes
     away = [5, 0, 0] if outcomes[-1] == "reacquired" else [0, 0, 0]
-    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + away, atol=1e-9)
+    np.testing.assert_allclose(robot.fusion.estimate.pose, robot.truth[-1] + away, atol=1e-9)
 
 
 def test_a_sender_with_nonsense_for_stamps_does_not_fill_the_memory() -> None:
     timeline = pose_fusion.Timeline(2.0)
     for number in range(20_000):
         moved = motion(ORIGIN + 1000 * number, np.zeros(3), 1e-6)
-        timeline.append(pose_fusion.Entry(moved.stamp, moved, np.zeros(3), np.zeros(3), EXACT))
+        timeline.append(pose_fusion.Entry(moved.stamp, moved, np.zeros(3), pose_fusion.Estimate(np.zeros(3), EXACT)))
     assert len(timeline.entries) <= 8000
 
 
@@ -176,11 +174,11 @@ def test_a_pose_that_was_set_holds_against_poses_measured_before() -> None:
     robot = Robot().drive(50)
     robot.see(0.2)
     robot.fusion.set_pose(np.array([7.0, 8.0, 1.0]), EXACT)
-    np.testing.assert_allclose(robot.fusion.pose, [7.0, 8.0, 1.0])
+    np.testing.assert_allclose(robot.fusion.estimate.pose, [7.0, 8.0, 1.0])
     assert robot.see(0.4) == "too late"
     robot.drive(10)
     expected = advance(np.array([7.0, 8.0, 1.0]), 10 * np.array([0.005, 0.0, 0.005]), "arc")
-    np.testing.assert_allclose(robot.fusion.pose, expected, atol=1e-12)
+    np.testing.assert_allclose(robot.fusion.estimate.pose, expected, atol=1e-12)
 
 
 def test_after_a_reset_the_next_pose_says_where_the_robot_is() -> None:
@@ -190,25 +188,25 @@ def test_after_a_reset_the_next_pose_says_where_the_robot_is() -> None:
     assert not robot.fusion.located
     robot.drive(20)
     assert robot.see(0.6, (100, 0, 0)) == "located"
-    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1] + [100, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(robot.fusion.estimate.pose, robot.truth[-1] + [100, 0, 0], atol=1e-9)
 
 
 def test_a_heading_beyond_half_a_turn_is_the_same_heading() -> None:
     robot = Robot().drive(100)
     robot.see(0.5)
     assert robot.see(0.6, (0, 0, 2 * np.pi)) == "fused"
-    np.testing.assert_allclose(robot.fusion.pose, robot.truth[-1], atol=1e-9)
+    np.testing.assert_allclose(robot.fusion.estimate.pose, robot.truth[-1], atol=1e-9)
 
 
 @given(st.floats(0.0, 0.5))
 def test_the_pose_at_a_time_lies_on_the_path_and_asking_changes_nothing(time: float) -> None:
     robot = Robot().drive(50)
     robot.see(0.1)
-    before = robot.fusion.pose.copy()
+    before = robot.fusion.estimate.pose.copy()
     found = robot.fusion.at(stamp(time))
     np.testing.assert_allclose(found[0][:2], robot.at(time)[:2] if time >= 0.1 else found[0][:2], atol=1e-9)
     np.testing.assert_allclose(robot.timeline.odometry_at(stamp(time)), robot.at(time), atol=1e-9)
-    np.testing.assert_array_equal(robot.fusion.pose, before)
+    np.testing.assert_array_equal(robot.fusion.estimate.pose, before)
 
 
 @pytest.mark.parametrize("time", [-1.0, 0.51])
@@ -225,7 +223,7 @@ def test_the_covariance_is_that_of_a_kalman_filter_in_one_dimension() -> None:
     robot.see(0.02)
     # heading: variance 1e-4, then 1e-6 of a sample's noise, then fused with another 1e-4
     predicted = 1e-4 + 1e-6
-    assert robot.fusion.covariance[2, 2] == pytest.approx(predicted * 1e-4 / (predicted + 1e-4), rel=1e-3)
+    assert robot.fusion.estimate.covariance[2, 2] == pytest.approx(predicted * 1e-4 / (predicted + 1e-4), rel=1e-3)
 
 
 def test_the_timeline_keeps_what_it_promises_and_little_more() -> None:

@@ -1,6 +1,7 @@
 """Those who listen to robots: ``subscribe``, recorder, Foxglove server and monitor, with real sessions."""
 
 import json
+import math
 import os
 import signal
 import struct
@@ -21,6 +22,7 @@ import pytest
 import zenoh
 from commands import refused
 from mcap.reader import make_reader
+from nodes import config_of
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from samples import (
     COVARIANCE,
@@ -39,10 +41,12 @@ from timing import PATIENCE
 
 from omnibench.errors import ConfigError, DataError, UnknownNameError
 from omnibench.live.monitor import HealthSummary, RobotMonitor, RobotStatus
-from omnibench.live.record import FoxgloveServer, Recorder
+from omnibench.live.record import Recorder
 from omnibench.live.subscriber import Subscription, subscribe
 from omnibench.live.topics import TOPICS, GraphNode, KeySpace, Profile, Publisher
+from omnibench.live.viewers import FoxgloveServer, RerunView, foxglove_layout
 from omnibench.live.wire import JOINT_STATE, Diagnostic, Diagnostics, Odometry
+from omnibench.robot.kinematics import Mount
 
 
 def odom_publisher(loopback: Loopback, topic: str = "odom", profile: Profile = "plain") -> Publisher[Odometry]:
@@ -281,7 +285,7 @@ def test_a_recording_holds_every_payload_of_every_topic_as_it_was_sent(loopback:
         for payload in sent[name]:
             publisher.put_encoded(payload)
     until(lambda: recorder.messages == 50 * len(TOPICS), "all messages")
-    recorder.stop()
+    recorder.close()
     assert messages_of(recorder.path) == sent
     assert dict(recorder.counts) == dict.fromkeys(sent, 50)
     assert recorder.bytes == recorder.path.stat().st_size
@@ -294,7 +298,7 @@ def test_times_in_a_recording_are_those_of_header_and_arrival(loopback: Loopback
     odom.put(sample("odom", 7))
     odom.put(sample("odom", 8))
     until(lambda: recorder.messages == 2, "all messages")
-    recorder.stop()
+    recorder.close()
     with recorder.path.open("rb") as file:
         first, second = [message for _, _, message in make_reader(file).iter_messages()]
     assert [first.publish_time, second.publish_time] == [STAMP + 7 * PERIOD, STAMP + 8 * PERIOD]
@@ -310,7 +314,7 @@ def test_payloads_that_cannot_be_decoded_are_counted_and_left_out(loopback: Loop
         odom.put_encoded(broken)
     odom.put_encoded(whole)
     until(lambda: recorder.messages, "the message that can")
-    recorder.stop()
+    recorder.close()
     assert messages_of(recorder.path) == {"/apr02/odom": [whole]}
     assert recorder.undecodable == {"/apr02/odom": 5}
 
@@ -356,7 +360,7 @@ def test_what_cannot_be_recorded_is_named_and_no_file_changes(
 ) -> None:
     (tmp_path / "run.mcap").write_text("precious")
     with pytest.raises((DataError, ConfigError, UnknownNameError), match=named):
-        Recorder(loopback.client(), KEYS, [robot], tmp_path / file, *([topics] if topics else [])).start()
+        Recorder(loopback.client(), KEYS, [robot], tmp_path / file, *([topics] if topics else []))
     assert [each.read_text() for each in tmp_path.iterdir()] == ["precious"]
 
 
@@ -400,7 +404,7 @@ def test_a_repeated_message_is_recorded_once_and_lost_ones_counted(loopback: Loo
     for number in (1, 2, 2, 1, 3, 11):
         odom.put_numbered(TOPICS["odom"].encode(sample("odom", number)), number, (7, number, 1, False))
     until(lambda: recorder.messages == 4, "the four messages")
-    recorder.stop()
+    recorder.close()
     sent = [TOPICS["odom"].encode(sample("odom", number)) for number in (1, 2, 3, 11)]
     assert messages_of(recorder.path) == {"/apr02/odom": sent}
     assert recorder.missed == {"/apr02/odom": 7}
@@ -515,6 +519,78 @@ def test_a_client_that_does_not_read_holds_up_nobody(loopback: Loopback, server:
         for _ in range(1500):  # 15 MB: more than the sockets and the backlog of the frozen client hold
             joints.put_encoded(payload)
             assert reader.recv(timeout=PATIENCE)
+
+
+def test_a_layout_for_foxglove_holds_panels_of_each_robots_topics(tmp_path: Path) -> None:
+    config = config_of(tmp_path, "apr02", "apr03", foxglove=True)
+    layout = json.loads(foxglove_layout(config))
+    panels, topics = layout["configById"], set(TOPICS) - {"tf", "joint_states"}
+    tabs = {tab["title"]: tab["layout"] for tab in panels[layout["layout"]]["tabs"]}
+    for robot, tree in tabs.items():
+        shown = panels_of(tree)
+        text = json.dumps([panels[name] for name in shown])
+        assert {topic for topic in topics if f"/{robot}/{topic}" in text} == topics
+        assert panels[f"3D!{robot}"]["followTf"] == "map"
+    assert panels.keys() == {"Tab!robots"}.union(*map(panels_of, tabs.values()))
+    assert list(tabs) == ["apr02", "apr03"]
+
+
+def panels_of(tree: str | dict[str, Any]) -> set[str]:
+    """The names of the panels in a layout's tree."""
+    return {tree} if isinstance(tree, str) else panels_of(tree["first"]) | panels_of(tree["second"])
+
+
+def test_rerun_gets_paths_covariances_innovations_and_health(loopback: Loopback, tmp_path: Path) -> None:
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    each, mount = publishers(loopback), Mount(x=0.1, y=0.0, yaw=0.0)
+    file = tmp_path / "shown" / "drive.rrd"
+    with RerunView(loopback.client(), KEYS, {"apr02": mount}, file) as view:
+        wait_for_subscribers(*(each[topic] for topic in ("odom", "odometry/filtered", "slam_pose", "diagnostics")))
+        each["odometry/filtered"].put(replace(odometry(-10), pose_covariance=1e4 * np.eye(3)))  # not located yet
+        for k in range(0, 100, 10):
+            each["odom"].put(odometry(k))
+            fused = odometry(k, "map")
+            each["odometry/filtered"].put(replace(fused, pose=np.array([0.0, 0.1 * k, np.pi / 2])))
+        each["slam_pose"].put_encoded(b"garbage")
+        pose = np.array([0.03, 9.0 + 0.031 + 0.1 - 0.05, np.pi / 2])  # 0.1 s after the last fused pose, which moves on
+        each["diagnostics"].put(sample("diagnostics"))
+        each["slam_pose"].put(replace(sample("slam_pose"), stamp=STAMP + 100 * PERIOD, pose=pose))
+        until(lambda: "apr02/slam_pose" in view._shown, "the last message")
+    columns: dict[str, list[Any]] = {}
+    for part in chunk.RrdReader(str(file)).stream().to_chunks():
+        batch = part.to_record_batch().to_pydict()
+        for name, values in batch.items():
+            columns.setdefault(f"{part.entity_path} {name.rpartition(':')[2]}", []).extend(values)
+    innovation = [columns[f"/apr02/innovation/{each} scalars"] for each in ("position/x", "position/y", "heading")]
+    np.testing.assert_allclose(innovation, [[[0.03 - 0.012]], [[-0.05]], [[-math.degrees(0.045)]]], atol=1e-9)
+    paths = {name: np.array(columns[f"/apr02/{name} strips"])[:, 0, :, :2] for name in ("odom", "filtered")}
+    np.testing.assert_allclose(paths["filtered"][1:, 1] - paths["filtered"][1:, 0], [[0.0, 2.0]] * 4, atol=1e-6)
+    assert np.array_equal(paths["odom"][1:, 0], paths["odom"][:-1, 1])  # without gaps
+    (ellipse,) = np.array(columns["/apr02/filtered/ellipse strips"])[:, 0, :, :2]
+    distances = np.einsum("ni,ij,nj->n", ellipse, np.linalg.inv(COVARIANCE[:2, :2]), ellipse)
+    np.testing.assert_allclose(distances, 5.991, rtol=1e-4)
+    deviations = [columns[f"/apr02/sigma/{each}/odom scalars"][0] for each in ("position", "heading")]
+    np.testing.assert_allclose(deviations, [[math.sqrt(6.5e-4)], [math.degrees(0.04)]])
+    ((turned,),) = columns["/apr02/odom rotation_axis_angle"]  # of odom's frame, to lie on the fused path
+    assert turned["angle"] == pytest.approx(np.pi / 2 - 0.7)
+    assert columns["/apr02/diagnostics/odometry text"] == [["late samples"]]
+    ((table,),) = columns["/apr02/health text"]
+    assert "| rate_hz | 99.8 |" in table
+
+
+def test_what_rerun_cannot_begin_with_is_named(
+    loopback: Loopback, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(DataError, match=r"drive\.rrd: cannot be written"):
+        RerunView(loopback.router, KEYS, {"apr02": None}, tmp_path / "file" / "drive.rrd")
+    monkeypatch.setattr(sys, "executable", "/bin/false")  # a viewer on a machine without a screen
+    with refused(ConfigError, match=r"viewer does not open.*FILE\.rrd"):
+        RerunView(loopback.router, KEYS, {"apr02": None}, None)
+    monkeypatch.setitem(sys.modules, "rerun", None)  # what an absent package looks like
+    with refused(ConfigError, match=r'pip install "omnibench\[rerun\]"'):
+        RerunView(loopback.router, KEYS, {"apr02": None}, None)
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ from omnibench.live.control import (
 )
 from omnibench.live.drive import ReplayConfig, concatenate_runs
 from omnibench.live.health import Health
-from omnibench.live.node import LiveNode
+from omnibench.live.node import Intake, LiveNode
 from omnibench.live.presence import alive_robots
 from omnibench.live.record import Recorder
 from omnibench.live.replay import Player
@@ -324,7 +324,7 @@ def test_a_recorder_or_server_that_cannot_begin_is_named(tmp_path: Path, monkeyp
             assert not (tmp_path / "run.mcap").exists()
             assert_nothing_is_open(config)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # what an absent package looks like
-    with pytest.raises(ConfigError, match='pip install "foxglove-sdk"'):
+    with pytest.raises(ConfigError, match=r'pip install "omnibench\[foxglove\]"'):
         LiveNode(config_of(tmp_path, foxglove=True))
 
 
@@ -351,9 +351,9 @@ def test_a_waiting_replay_finds_the_node_before_its_recorder(tmp_path: Path, mon
     alive: list[tuple[str, ...]] = []
 
     class LateRecorder(Recorder):
-        def start(self) -> None:
-            alive.append(alive_robots(self._session, 1.0))
-            super().start()
+        def __init__(self, session: zenoh.Session, *others: Any, **options: Any) -> None:
+            alive.append(alive_robots(session, 1.0))
+            super().__init__(session, *others, **options)
 
     monkeypatch.setattr("omnibench.live.node.Recorder", LateRecorder)
     driven(config_of(tmp_path, record="run.mcap"), 0.1)
@@ -431,6 +431,21 @@ def test_samples_of_replays_are_all_published(tmp_path: Path, attachments: list[
     assert len(odometry) == len(attachments)
     assert health.counts["unpublished"] == 0
     assert health.behind_s == 0.0 or attachments is not FLOW  # no backlog
+
+
+def test_turns_that_take_most_of_the_time_are_run_in_a_thread_of_their_own() -> None:
+    with Intake() as intake:
+        time.sleep(0.05)
+        intake.run(lambda: None)
+        assert not intake.busy
+        for _ in range(20):
+            intake.run(lambda: time.sleep(0.01))
+        assert intake.busy
+        threads: list[str] = []
+        intake.queue(lambda: 1 / 0)  # an error ends no other turn
+        intake.queue(lambda: threads.append(threading.current_thread().name))
+        until(lambda: threads, "the turn that was queued")
+    assert threads == ["intake"]
 
 
 @pytest.mark.parametrize(("size", "sent", "overflow"), [(500_000, 100, 36), (4, 20_100, 100)])

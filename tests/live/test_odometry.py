@@ -128,7 +128,7 @@ def test_the_covariance_is_regular_and_grows_while_nothing_comes(bare: bool) -> 
     live = LiveOdometry(calibration(deviation=None).model_copy(update={"noise": None}) if bare else calibration())
     live.step(step(0.01, [0.02, 0.01, -0.02]))
     assert np.linalg.eigvalsh(live.covariance)[0] > 0
-    traces = [float(np.trace(live.covariance_after_silence(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
+    traces = [float(np.trace(live.covariance + live.silence_covariance(seconds))) for seconds in (0.0, 0.5, 1.0, 5.0)]
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
 
@@ -167,8 +167,8 @@ def test_a_filter_takes_the_error_of_the_matrix_as_noise_that_lasts_a_second() -
 def test_held_steering_angles_make_a_way_as_doubtful_in_many_steps_as_in_one() -> None:
     """The angle is wrong in the same way all along, so that deviations add up, and not variances."""
     once, often = (LiveOdometry(calibration(deviation=None)) for _ in range(2))
-    whole = [once.step(replace(step(1.0, [1.0, 1.0, 1.0], blind=1.0), held=True))]
-    parts = [often.step(replace(step(0.1, [0.1, 0.1, 0.1], blind=0.1), held=True)) for _ in range(10)]
+    whole = [once.step(step(1.0, [1.0, 1.0, 1.0], blind=1.0)._replace(held=True))]
+    parts = [often.step(step(0.1, [0.1, 0.1, 0.1], blind=0.1)._replace(held=True)) for _ in range(10)]
     for name in ("position_variance", "heading_variance"):
         assert sum(getattr(part, name) for part in parts) == pytest.approx(getattr(whole[0], name))
 

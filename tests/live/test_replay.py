@@ -32,8 +32,9 @@ from omnibench.config import parse_yaml, to_yaml, validate
 from omnibench.data.storage import save_dataset
 from omnibench.errors import ConfigError
 from omnibench.live.config import read_live_config
+from omnibench.live.delivery import WINDOW, DeliveryError
 from omnibench.live.drive import ConcatenatedDrive, ReplayConfig, concatenate_runs
-from omnibench.live.replay import WINDOW, DeliveryError, Player, PlayReport, ReplayMessages
+from omnibench.live.replay import Player, PlayReport, ReplayMessages
 from omnibench.live.topics import GraphNode, KeySpace, Profile
 from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, packed
 from omnibench.progress import Progress

@@ -27,10 +27,9 @@ from omnibench.errors import ConfigError
 from omnibench.live.config import read_live_config
 from omnibench.live.drive import ReplayConfig, concatenate_runs
 from omnibench.live.keys import make_keys
-from omnibench.live.network import Right, open_session, rights_of, zenoh_config
+from omnibench.live.network import Access, Right, SessionConfig, Tls, User, open_session, rights_of, zenoh_config
 from omnibench.live.node import LiveNode
 from omnibench.live.replay import Player
-from omnibench.live.session_config import Access, SessionConfig, Tls, User
 from omnibench.live.topics import GraphNode, KeySpace
 
 MEMBERS = ("node", "apr02", "apr03", "viewer", "operator", "remote", "stranger")

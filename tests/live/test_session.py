@@ -24,9 +24,8 @@ from sessions import free_port, until
 
 from omnibench.config import read_model, to_yaml, validate
 from omnibench.errors import ConfigError
-from omnibench.live.keys import make_keys
-from omnibench.live.network import open_session, zenoh_config
-from omnibench.live.session_config import SessionConfig, Tls, User, check_files, read_certificate, read_key
+from omnibench.live.keys import check_files, make_keys, read_certificate, read_key
+from omnibench.live.network import SessionConfig, User, open_session, zenoh_config
 
 
 @pytest.fixture
@@ -272,8 +271,9 @@ def test_listening_to_a_network_without_any_protection_is_logged(caplog: pytest.
         assert f"node apr listens at {endpoint}, where anybody on the network may connect" in caplog.text
 
 
-def tls(folder: Path, name: str, key: str | None = None) -> Tls:
-    return Tls(ca=folder / "ca.pem", certificate=folder / f"{name}.pem", key=folder / (key or f"{name}.key"))
+def files(folder: Path, name: str, key: str | None = None) -> tuple[Path, Path, Path]:
+    """The authority's certificate, a name's, and its key."""
+    return folder / "ca.pem", folder / f"{name}.pem", folder / (key or f"{name}.key")
 
 
 def test_a_certificate_carries_its_name_and_its_hosts(tmp_path: Path) -> None:
@@ -388,17 +388,17 @@ def test_files_that_cannot_be_used_are_named(tmp_path: Path, change: Any, key: s
     make_keys(tmp_path, ["node", "apr02"])
     change(tmp_path)
     with pytest.raises(ConfigError, match=named):
-        check_files(tls(tmp_path, "node", key))
+        check_files(*files(tmp_path, "node", key))
 
 
 def test_a_clients_certificate_and_one_that_expires_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     make_keys(tmp_path, ["node", "apr02"])
-    check_files(tls(tmp_path, "node"), listening=True)
+    check_files(*files(tmp_path, "node"), listening=True)
     with pytest.raises(ConfigError, match=r"apr02\.pem is a client's"):
-        check_files(tls(tmp_path, "apr02"), listening=True)
+        check_files(*files(tmp_path, "apr02"), listening=True)
     assert not caplog.text
     expire(tmp_path, "node", datetime.now(UTC) - timedelta(hours=12))
-    check_files(tls(tmp_path, "node"))
+    check_files(*files(tmp_path, "node"))
     assert "node.pem expires on" in caplog.text
 
 

@@ -21,9 +21,10 @@ from omnibench.config import to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.fusion import FusionSettings
 from omnibench.live.health import Counts, anomalies_in_words, diagnostic
-from omnibench.live.state import ExtrapolationMonitor, PublishedStamps, RobotMemory, SavedState
+from omnibench.live.odometry import ExtrapolationMonitor
+from omnibench.live.state import RobotMemory, SavedState
 from omnibench.live.topics import Update
-from omnibench.live.tracker import RobotTracker
+from omnibench.live.tracker import PublishedStamps, RobotTracker
 from omnibench.live.wheels import WheelSettings, WheelStep
 from omnibench.live.wire import JOINT_STATE, JointState
 from omnibench.robot.calibration import Calibration, matrix_rows, write_calibration

@@ -9,13 +9,12 @@ import pytest
 from drives import ORIGIN, PERIOD, SECOND, Drive, drive
 from hypothesis import given
 from hypothesis import strategies as st
-from sample_robots import CAR, TRICYCLE
-from steered import SWERVE, only, steered_calibration, steered_drive
+from sample_robots import CAR, DIFFERENTIAL, TRICYCLE
+from steered import SWERVE, only, steered_drive
 
 from omnibench.errors import ConfigError
 from omnibench.live.health import Counts
-from omnibench.live.state import new_state
-from omnibench.live.wheels import WheelAngles, WheelInput, WheelSettings, WheelStep, joints_of
+from omnibench.live.wheels import WheelSettings, WheelState, WheelStep, admit, decode, joints_of, unwrap
 from omnibench.live.wire import JointState
 from omnibench.robot.kinematics import Robot
 from omnibench.testing import synthetic_robot
@@ -23,12 +22,18 @@ from omnibench.testing import synthetic_robot
 NAMES = ("a", "b", "c")
 
 
-class Receiver:
-    """A wheel input that is fed with messages, by default as soon as they are stamped."""
+def steps_of(message: JointState, arrival: float, state: WheelState, skipped: int = 0) -> list[WheelStep]:
+    reading = decode(message, arrival, state, skipped)
+    return [] if reading is None else admit(reading, state)
 
-    def __init__(self, **settings: object) -> None:
+
+class Receiver:
+    """The wheel input of a robot, fed with messages, by default as soon as they are stamped."""
+
+    def __init__(self, robot: Robot | None = None, **settings: object) -> None:
         self.counts = Counts()
-        self.input = WheelInput(NAMES, WheelSettings.model_validate(settings), PERIOD, self.counts)
+        chosen = WheelSettings.model_validate(settings)
+        self.input = WheelState(robot or synthetic_robot(), chosen, PERIOD, self.counts)
         self.steps: list[WheelStep] = []
 
     def take(
@@ -37,7 +42,7 @@ class Receiver:
         made: list[WheelStep] = []
         for index, message in enumerate(messages):
             arrival = (message.stamp - ORIGIN) / SECOND if arrivals is None else arrivals[index]
-            made += self.input.take(message, arrival, 0 if skipped is None else skipped[index])
+            made += steps_of(message, arrival, self.input, 0 if skipped is None else skipped[index])
         self.steps += made
         return made
 
@@ -206,7 +211,7 @@ def test_a_counter_that_begins_at_zero_again_after_a_silence_is_no_motion(silenc
 
 
 def test_a_restarted_counter_is_found_out_by_a_node_that_was_itself_restarted(receiver: Receiver) -> None:
-    receiver.input.resume(ORIGIN - 36_000 * SECOND, np.array([5000.0, 4200.0, 3900.0]), arrival=-36_000.0)
+    receiver.input.resume(ORIGIN - 36_000 * SECOND, [5000.0, 4200.0, 3900.0], arrival=-36_000.0)
     (step,) = receiver.take(at(0, 0.1, 0.0, 0.2))
     assert step.angles.tolist() == [0, 0, 0]
     assert receiver.counts.counter_restarts == 1
@@ -289,12 +294,20 @@ def test_what_is_not_finite_is_refused_and_the_next_goes_on(value: float, rates:
     assert len(receiver.take(at(0.03, 0.03, 0, 0, rates=rates))) == 1
 
 
+@pytest.mark.parametrize("settings", [{}, {"wrap": 2.0}])
+def test_a_counter_that_no_saved_state_could_hold_is_refused(settings: dict[str, float]) -> None:
+    receiver = Receiver(**settings)
+    receiver.take(at(0, 0, 0, 0), at(0.01, 1e308, 0, 0), at(0.02, -1e308, 0, 0), at(0.03, 0.1, 0, 0))
+    assert receiver.driven.tolist() == [0.1, 0, 0]
+    assert receiver.counts.not_finite == 2
+
+
 def test_a_rate_beyond_the_limit_is_refused_with_both_told() -> None:
     receiver = Receiver(max_rate=20)
     receiver.take(at(0, 0, 0, 0, rates=True))
     assert receiver.take(at(0.01, 0, 1e6, 0, rates=True)) == []
     assert receiver.counts.too_fast == 1
-    assert "max_rate 20" in receiver.input.last_refusal
+    assert "max_rate 20" in receiver.input.refusal
 
 
 def test_joints_are_found_by_name_in_any_order_and_among_others_and_a_missing_one_is_named() -> None:
@@ -304,7 +317,7 @@ def test_joints_are_found_by_name_in_any_order_and_among_others_and_a_missing_on
         receiver.take(JointState(ORIGIN + round(time * SECOND), names, np.array(values) * 0.1, None))
     np.testing.assert_allclose(receiver.driven, [0.1, 0.2, 0.3])
     assert receiver.take(at(0.02, 0, 0, 0)) == []
-    assert receiver.input.last_refusal == "no joint 'left' among a, b, c; set wheels.joints"
+    assert receiver.input.refusal == "no joint 'left' among a, b, c; set wheels.joints"
 
 
 def test_irregular_periods_are_taken_as_they_are_stamped(receiver: Receiver) -> None:
@@ -357,23 +370,12 @@ def test_numbered_samples_that_are_lost_from_a_burst_are_missing_and_no_clock_ha
 def test_a_slow_robot_may_have_turned_its_wheels_by_half_a_turn_in_a_silence(turned: float, believed: bool) -> None:
     """At 0.1 rad/s so far, 1 s may hold 1.5 x 0.1 rad and half a turn to get going; more is a counter set anew."""
     counts = Counts()
-    angles = WheelAngles(2, None, 50.0, counts)
-    angles.begin(np.array([20.0, 30.0]))
-    angles.turned(np.array([20.05, 30.05]), np.full(2, 0.1), 0.5)
-    unseen, whole = angles.turned_unseen(np.array([20.05, 30.05]) + turned, 1.0)
+    state = WheelState(DIFFERENTIAL, WheelSettings(max_rate=50.0), PERIOD, counts)
+    state.count_from([20.0, 30.0])
+    unwrap([20.05, 30.05], [0.05, 0.05], 0.5, state)
+    unseen, whole = unwrap([20.05 + turned, 30.05 + turned], None, 1.0, state)
     assert unseen == pytest.approx([turned * believed] * 2)
     assert (whole, counts.counter_restarts) == (believed, int(not believed))
-
-
-class SteeringReceiver:
-    """The wheel input of a robot, fed with messages as soon as they are stamped."""
-
-    def __init__(self, robot: Robot = TRICYCLE, **settings: object) -> None:
-        state = new_state("robot", steered_calibration(robot), WheelSettings.model_validate(settings), None)
-        self.counts, self.input = state.counts, state.wheel_input
-
-    def take(self, *messages: JointState) -> list[WheelStep]:
-        return [step for each in messages for step in self.input.take(each, (each.stamp - ORIGIN) / SECOND)]
 
 
 def at_joints(time: float, **joints: float) -> JointState:
@@ -395,16 +397,16 @@ def steering(steps: list[WheelStep]) -> list[float]:
     ],
 )
 def test_samples_before_the_first_steering_angle_are_refused_with_the_reason(first: JointState, reason: str) -> None:
-    receiver = SteeringReceiver()
+    receiver = Receiver(TRICYCLE)
     assert receiver.take(first) == []
     assert receiver.counts.no_steering == 1
-    assert receiver.input.last_refusal.startswith("no steering angle yet: ")
-    assert receiver.input.last_refusal.endswith(reason)
+    assert receiver.input.refusal.startswith("no steering angle yet: ")
+    assert receiver.input.refusal.endswith(reason)
     assert len(receiver.take(at_joints(0.01, front=1.0, front_steering=0.1))) == 1
 
 
 def test_a_sample_steers_as_the_newest_angle_says_which_may_come_in_messages_of_its_own() -> None:
-    receiver = SteeringReceiver()
+    receiver = Receiver(TRICYCLE)
     assert receiver.take(at_joints(0.0, front_steering=0.3)) == []
     steps = receiver.take(
         at_joints(0.005, front=0.0),
@@ -421,7 +423,7 @@ def test_a_sample_steers_as_the_newest_angle_says_which_may_come_in_messages_of_
 
 @given(st.lists(st.sets(st.sampled_from(["fl", "fr", "rl", "rr"])), min_size=20, max_size=20))
 def test_angles_are_those_of_whole_messages_however_the_joints_are_spread_over_several(apart: list[set[str]]) -> None:
-    whole, spread = SteeringReceiver(SWERVE), SteeringReceiver(SWERVE)
+    whole, spread = Receiver(SWERVE), Receiver(SWERVE)
     for sample, wheels in zip(steered_drive(0.19).samples(), apart, strict=True):
         own = tuple(f"{wheel}_steering" for wheel in wheels)
         beside = [name for name in sample.names if name not in own]
@@ -433,13 +435,13 @@ def test_angles_are_those_of_whole_messages_however_the_joints_are_spread_over_s
 
 @pytest.mark.parametrize("jump", [-3600.0, 3600.0])
 def test_steering_is_followed_over_a_jump_of_the_clock(jump: float) -> None:
-    receiver = SteeringReceiver()
+    receiver = Receiver(TRICYCLE)
     receiver.take(at_joints(0.0, front=0.0, front_steering=0.1))
     steps = [
         step
         for k in range(1, 6)
-        for step in receiver.input.take(
-            at_joints(PERIOD * k + jump, front=0.02 * k, front_steering=0.1 + 0.01 * k), PERIOD * k
+        for step in steps_of(
+            at_joints(PERIOD * k + jump, front=0.02 * k, front_steering=0.1 + 0.01 * k), PERIOD * k, receiver.input
         )
     ]
     np.testing.assert_allclose(steering(steps), [0.11, 0.12, 0.13, 0.14, 0.15])
@@ -447,7 +449,7 @@ def test_steering_is_followed_over_a_jump_of_the_clock(jump: float) -> None:
 
 
 def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unknown() -> None:
-    receiver = SteeringReceiver(max_steering_age=0.2)
+    receiver = Receiver(TRICYCLE, max_steering_age=0.2)
     receiver.take(at_joints(0.0, front=0.0, front_steering=0.1))
     steps = receiver.take(*(at_joints(PERIOD * k, front=0.02 * k) for k in range(1, 31)))
     assert steering(steps) == [0.1] * 30
@@ -456,7 +458,7 @@ def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unkno
     assert receiver.input.old_steering == pytest.approx(0.3)
     (again,) = receiver.take(at_joints(0.31, front=0.62, front_steering=0.5))
     assert (again.blind, receiver.input.old_steering) == (0.0, 0.0)
-    several = SteeringReceiver(SWERVE)
+    several = Receiver(SWERVE)
     first, *others = steered_drive(0.5).samples()
     several.take(first, *(only(each, "fl", "fr", "rl", "rr", "fl_steering", "rr_steering") for each in others))
     assert several.counts.old_steering == 30
@@ -465,14 +467,14 @@ def test_an_angle_that_misses_for_long_is_held_and_said_and_makes_the_path_unkno
 @pytest.mark.parametrize(("behind", "old"), [(1, 0), (10, 0), (30, 30)])
 def test_steering_behind_its_wheel_samples_counts_for_the_next_until_too_old(behind: int, old: int) -> None:
     """Messages of the steering that wait in a loaded network; every angle tells the number of its sample."""
-    receiver = SteeringReceiver(max_steering_age=0.2)
+    receiver = Receiver(TRICYCLE, max_steering_age=0.2)
     receiver.take(at_joints(0.0, front=0.0, front_steering=0.0))
     steps = []
     for k in range(1, 51):
         now = PERIOD * k
-        steps += receiver.input.take(at_joints(now, front=0.02 * k), now)
+        steps += steps_of(at_joints(now, front=0.02 * k), now, receiver.input)
         if k >= behind:
-            receiver.input.take(at_joints(PERIOD * (k - behind), front_steering=1e-3 * (k - behind)), now)
+            steps_of(at_joints(PERIOD * (k - behind), front_steering=1e-3 * (k - behind)), now, receiver.input)
     np.testing.assert_allclose(steering(steps), [1e-3 * max(0, k - 1 - behind) for k in range(1, 51)], atol=1e-12)
     assert sum(bool(step.blind) for step in steps) == receiver.counts.old_steering == old
     assert receiver.counts.late == 0
@@ -480,7 +482,7 @@ def test_steering_behind_its_wheel_samples_counts_for_the_next_until_too_old(beh
 
 def test_an_angle_that_wraps_at_a_turn_goes_on_the_shorter_way() -> None:
     angles = np.linspace(2.0, 9.0, 100)
-    receiver = SteeringReceiver()
+    receiver = Receiver(TRICYCLE)
     wrapped = (angles + math.pi) % (2 * math.pi) - math.pi
     steps = receiver.take(*(at_joints(PERIOD * k, front=0.0, front_steering=angle) for k, angle in enumerate(wrapped)))
     np.testing.assert_allclose(steering(steps), angles, atol=1e-12)
@@ -488,10 +490,10 @@ def test_an_angle_that_wraps_at_a_turn_goes_on_the_shorter_way() -> None:
 
 @pytest.mark.parametrize("angle", [30.0, -1.6])
 def test_a_car_that_steers_in_degrees_is_told(angle: float) -> None:
-    receiver, rear = SteeringReceiver(CAR), {"left": 0.0, "right": 0.0}
+    receiver, rear = Receiver(CAR), {"left": 0.0, "right": 0.0}
     assert receiver.take(at_joints(0.0, **rear, front_left_steering=angle, front_right_steering=0.1)) == []
-    assert f"'front_left_steering' says {angle:g} rad" in receiver.input.last_refusal
-    assert "degrees" in receiver.input.last_refusal
+    assert f"'front_left_steering' says {angle:g} rad" in receiver.input.refusal
+    assert "degrees" in receiver.input.refusal
     steps = receiver.take(at_joints(0.01, **rear, front_left_steering=0.1, front_right_steering=0.1))
     steps += receiver.take(at_joints(0.02, **rear, front_left_steering=angle, front_right_steering=0.2))
     assert [step.steering.tolist() for step in steps if step.steering is not None] == [[0.1, 0.1], [0.1, 0.2]]
@@ -499,19 +501,19 @@ def test_a_car_that_steers_in_degrees_is_told(angle: float) -> None:
 
 
 def test_an_angle_that_no_wheel_reaches_one_wheel_without_an_angle_and_other_joints_are_refused() -> None:
-    receiver, swerve, sample = SteeringReceiver(), SteeringReceiver(SWERVE), steered_drive(0.1).samples()[0]
+    receiver, swerve, sample = Receiver(TRICYCLE), Receiver(SWERVE), steered_drive(0.1).samples()[0]
     assert receiver.take(at_joints(0.0, front=0.0, front_steering=-1e308)) == []
     receiver.take(at_joints(0.01, front=0.0, front_steering=0.1), at_joints(0.02, front=0.0, front_steering=1e308))
     assert receiver.counts.bad_steering == 2
     assert receiver.take(at_joints(0.03, shoulder=1.0, elbow=2.0)) == []
-    assert "'front' among shoulder, elbow" in receiver.input.last_refusal
+    assert "'front' among shoulder, elbow" in receiver.input.refusal
     assert swerve.take(replace(sample, positions=np.where(np.arange(8) == 1, np.nan, sample.positions))) == []
     assert swerve.counts.not_finite == 1
 
 
 def test_what_ros2_control_does_not_tell_is_nan_and_is_not_taken_for_a_reading() -> None:
     """Wheels with a velocity interface alone, steering joints with a position alone, in one message."""
-    receiver, path = SteeringReceiver(SWERVE), steered_drive(0.3)
+    receiver, path = Receiver(SWERVE), steered_drive(0.3)
     for sample in path.samples():
         positions = np.where([name.endswith("_steering") for name in sample.names], sample.positions, np.nan)
         (step,) = receiver.take(replace(sample, positions=positions))
@@ -525,7 +527,7 @@ def test_joints_are_called_like_the_wheels_unless_they_are_named() -> None:
     assert joints_of(CAR).names == ("left", "right", "front_left_steering", "front_right_steering")
     named = WheelSettings(joints=("traction",), steering_joints=("fork",))
     assert joints_of(TRICYCLE, named).names == ("traction", "fork")
-    steps = SteeringReceiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(
+    steps = Receiver(TRICYCLE, joints=["traction"], steering_joints=["fork"]).take(
         at_joints(0.0, traction=0.0, fork=0.2)
     )
     assert steering(steps) == [0.2]

@@ -73,7 +73,7 @@ def main() -> None:
         return error(model.poses([drive.log()])[0])
 
     theoretical = of(OdometryModel.of_design(calibration.robot, calibration.integration))
-    print(f"{len(drive.wheel_times)} samples of {drive.duration:.0f} s, simulated")
+    print(f"{len(drive.wheel_times)} samples of {drive.wheel_times[-1]:.0f} s, simulated")
     print(f"odometry, design matrix       {theoretical:8.4f} m")
     print(f"odometry, calibrated          {of(calibration.model):8.4f} m")
     results = {}

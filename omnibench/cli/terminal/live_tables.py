@@ -297,11 +297,12 @@ def plain_line(status: RobotStatus) -> str:
     for stream in _streams(status):
         x, y, heading = stream.message.pose.tolist()
         vx, vy, w = stream.message.twist.tolist()
+        position_sigma, heading_sigma = stream.message.position_sigma, math.degrees(stream.message.heading_sigma)
         rate = "" if stream.rate is None else f", {stream.rate:.1f} Hz"
         by_stamp = "" if stream.stamp_age is None else f" ({stream.stamp_age * 1e3:.0f} ms by its stamp)"
         parts.append(
             f"{stream.message.frame} x {x:.3f} m y {y:.3f} m heading {math.degrees(heading):.1f} deg (1 sigma "
-            f"{stream.position_sigma:.3f} m {math.degrees(stream.heading_sigma):.2f} deg) vx {vx:.3f} m/s vy {vy:.3f} "
+            f"{position_sigma:.3f} m {heading_sigma:.2f} deg) vx {vx:.3f} m/s vy {vy:.3f} "
             f"m/s w {math.degrees(w):.1f} deg/s{rate}, age {stream.age * 1e3:.0f} ms{by_stamp}"
         )
     return "; ".join(parts)
@@ -331,8 +332,8 @@ def _cells(robot: str, stream: OdometryStatus | None, by_stamp: bool) -> list[st
         _digits(x, 3),
         _digits(y, 3),
         f"{math.degrees(heading):.1f}",
-        _digits(stream.position_sigma, 3),
-        _digits(math.degrees(stream.heading_sigma), 2),
+        _digits(stream.message.position_sigma, 3),
+        _digits(math.degrees(stream.message.heading_sigma), 2),
         f"{vx:.2f}",
         f"{vy:.2f}",
         _digits(math.degrees(w), 1),

@@ -24,7 +24,7 @@ from chaos.programs import PATIENCE
 from chaos.robots import ORIGIN, STEP, batch
 from chaos.system import NUMBERED, PLAIN, PLAYED, System
 from chaos.witness import Heard
-from omnibench.live.replay import WINDOW
+from omnibench.live.delivery import WINDOW
 
 ROBOTS: Final = (PLAYED, NUMBERED, PLAIN)
 _KEPT: Final = 600  # messages at a replay's end that a kill may leave without a trace: a window and a batch

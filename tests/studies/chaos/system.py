@@ -26,9 +26,8 @@ from chaos.programs import COMMAND, PATIENCE, Ending, Program
 from chaos.robots import ORIGIN, RECORDING, NumberingRobot, PlainRobot, calibrations, write_recording
 from chaos.witness import Witness
 from omnibench.config import to_yaml
-from omnibench.live.network import open_session
+from omnibench.live.network import SessionConfig, open_session
 from omnibench.live.presence import alive_robots
-from omnibench.live.session_config import SessionConfig
 from omnibench.live.topics import GraphNode, KeySpace
 from omnibench.robot.calibration import write_calibration
 

@@ -14,8 +14,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
-from omnibench.live.network import open_session
-from omnibench.live.session_config import SessionConfig
+from omnibench.live.network import SessionConfig, open_session
 from omnibench.robot.kinematics import Array
 
 # A message's number, time of publishing and publisher, as rmw_zenoh's attachment has them.
