@@ -257,7 +257,7 @@ def guard(
     reference's scale, jumps and clock, the floor.
     """
     from omnibench.config import to_yaml
-    from omnibench.live.guard_recording import watch_recording
+    from omnibench.live.guarding import watch_recording
     from omnibench.report.guard import GuardResult
 
     shared.load_given_plugins(plugins)
@@ -266,10 +266,9 @@ def guard(
     with ProgressDisplay() as watch:
         recordings = omnibench.load_dataset(dataset)
         report, watching = watch_recording(omnibench.read_calibration(calibration), recordings, watch)
-    proposed = watching.proposed() if output is not None else None
-    if output is not None and proposed is not None:
-        write_text(output, to_yaml(proposed))
-    written = output if proposed is not None else None
+    written = None
+    if output is not None and report.proposed is not None:
+        write_text(written := output, to_yaml(report.proposed))
     result = GuardResult(report, watching, recordings.name, recordings.simulated, calibration, dataset, written)
     page.write(result.page, announced=True)
     show(result, as_json)

@@ -57,6 +57,11 @@ class LiveConfig(Model):
     description: str = ""
     robots: tuple[RobotConfig, ...] = Field((), description="may be empty for a router")
     fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
+    guard: bool | Literal["swap"] = Field(
+        True,
+        description="on: watch for changes of the robot where poses are fused; swap: drive with those that are accepted, "
+        "until they turn out worse",
+    )
     stale_after: Positive = Field(0.5, description="no wheel sample for so long makes the health stale, s")
     profile: Profile = Field("plain", description="plain: plain Zenoh and the DDS bridge; rmw, humble: rmw_zenoh")
     domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID, for rmw and humble")

@@ -43,12 +43,12 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from omnibench.config import Model
 from omnibench.errors import DataError
+from omnibench.live.health import Alarm, HeldOut, Kind, Proposal
 from omnibench.live.odometry import UNKNOWN_NOISE
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, CarDrive, pose_covariance, rotation
@@ -100,8 +100,6 @@ _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed
 _LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
 _LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too; chosen
 _SCALES: Final = (1, 4, 16, 64)  # blocks that Birge's ratio joins, as slip may last; chosen
-
-Kind = Literal["change", "fault", "burst", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,51 +250,6 @@ class Predictor:
         return Stretch(whole, slopes, spread, float(rolled.sum()), way, duration, begun, velocity, still)
 
 
-class Alarm(Model):
-    """What the guard tells: of a change or a fault its name, value and 95 % interval; of the others their size.
-
-    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low,
-    high: in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
-    detected_after_m: m that the wheels rolled between the two. alternatives: names that explain it nearly as well, of
-    which ``advice`` says how to tell them apart.
-    """
-
-    kind: Kind
-    name: str
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-    unit: str
-    trajectory: str
-    t: float
-    since: str
-    since_t: float
-    detected_after_m: float
-    alternatives: tuple[str, ...] = ()
-    advice: str = ""
-
-
-class HeldOut(Model):
-    """A proposal judged by motion after it was made. log_e: log of the likelihood ratio; ratio: of the errors."""
-
-    metres: float
-    log_e: float
-    error_ratio: float | None
-
-
-class Proposal(Model):
-    """A parameter with a new value, in shadow beside the calibration's. accepted: None while it is not decided."""
-
-    name: str
-    value: float
-    low: float | None = None
-    high: float | None = None
-    accepted: bool | None = None
-    rolled_back: bool = False
-    reason: str = ""
-    held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
-
-
 @dataclass(frozen=True)
 class Moment:
     """A time, s, of a run, and the metres rolled until then, of all runs."""
@@ -370,8 +323,7 @@ class Guard:
         self.metres = self.seconds = 0.0
         count = len(self.hypotheses.untold)
         self._untold = self.hypotheses.untold.copy()
-        self._assumed, self._delay = np.zeros(count), 0.0
-        self._variances: dict[int, float] = {}  # of these
+        self._assumed, self._driven_with, self._delay = np.zeros(count), np.zeros(count), 0.0
         self._delays: list[float] = []  # of the runs so far
         self._delay_variance = _DELAY**2
         self._adopted: dict[int, float] = {}  # hypothesis -> change
@@ -393,7 +345,9 @@ class Guard:
         self._begun = False
         self._open_at, self._told_at = 0, 0.0  # place of the open alarm, and the way when it was told, m
         self._shadow_from, self._shadow_errors = 0.0, (0.0, 0.0)
-        self._state, self._covariance = np.zeros(5), np.zeros((5, 5))
+        self._state: Array = np.zeros(5)
+        self._covariance: Array = np.zeros((5, 5))
+        self._white: Array = np.zeros(3)
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
         """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""
@@ -436,7 +390,7 @@ class Guard:
             self._covariance[3, 3] = 0.0
             self._covariance += self._delay_variance * delayed[:, None] * delayed
             self._begun = True
-        moved = turn @ stretch.moved + slopes @ self._assumed
+        moved = turn @ stretch.moved + slopes @ (self._assumed - self._driven_with)
         state[:3] += moved
         transition = np.eye(5)
         transition[0, 2], transition[1, 2] = -moved[1], moved[0]
@@ -642,44 +596,42 @@ class Guard:
         """Judge what waits, at the end of the last run."""
         self._flush()
 
-    def proposed(self) -> Calibration | None:
-        """The calibration with the changes that were accepted and not rolled back; None if there are none."""
-        names = [each.name for each in self.proposals if each.accepted and not each.rolled_back]
-        if not names:
+    @property
+    def accepted(self) -> dict[str, float]:
+        """The changes that were accepted and not rolled back, by the names of their parameters, in their units."""
+        names = {each.name for each in self.proposals if each.accepted and not each.rolled_back}
+        return {n: self._adopted[k] for k, n in enumerate(self.hypotheses.names) if n in names and k in self._adopted}
+
+    def proposed(self, changes: Mapping[str, float] | None = None) -> Calibration | None:
+        """The calibration with changes of parameters, by default those that were accepted; None if there are none."""
+        changes = self.accepted if changes is None else changes
+        if not changes:
             return None
-        calibration, hypotheses = self.calibration, self.hypotheses
-        change = np.zeros(calibration.matrix_array.size)
-        accepted = [named for named in self._adopted if hypotheses.names[named] in names]
-        more = self._refined(accepted)
-        for named, refinement in zip(accepted, more, strict=True):
-            change += (self._adopted[named] + refinement) * hypotheses.directions[: len(change), named]
+        calibration, names = self.calibration, self.hypotheses.names
+        moved = np.zeros(calibration.matrix_array.size)
+        for name, value in changes.items():
+            moved += value * self.hypotheses.directions[: len(moved), names.index(name)]
         changed: dict[str, object] = {
-            "matrix": _rows(calibration.matrix_array, change),
-            "name": f"{calibration.name}+{'+'.join(names)}",
+            "matrix": _rows(calibration.matrix_array, moved),
+            "name": f"{calibration.name}+{'+'.join(changes)}",
         }
         if calibration.plain is not None:
-            changed["plain"] = _rows(np.array(calibration.plain), change)
+            changed["plain"] = _rows(np.array(calibration.plain), moved)
         if calibration.parameters is not None:
             known = dict(calibration.parameters)
-            for each in self.proposals:
-                if each.name in known and each.name in names:
-                    shift = dict(zip((hypotheses.names[named] for named in accepted), more, strict=True))[each.name]
-                    low, high = ((each.low or 0.0) + shift, (each.high or 0.0) + shift)
-                    update = {"value": each.value + shift, "low": low, "high": high}
-                    known[each.name] = known[each.name].model_copy(update=update)
+            for name, value in changes.items():
+                if (parameter := known.get(name)) is not None:
+                    update = {"value": parameter.value + value, "low": None, "high": None}
+                    known[name] = parameter.model_copy(update=update)
             changed["parameters"] = known
         return calibration.model_copy(update=changed)
 
-    def _refined(self, accepted: Sequence[int]) -> list[float]:
-        """What motion since then adds to the values of accepted changes, as far as they were not sure."""
-        if not self._blocks or not accepted:
-            return [0.0] * len(accepted)
-        directions = self.hypotheses.directions[:, accepted]
-        ratio = max(self._ratio, _LEAST_RATIO)
-        whole = np.sum([block.whole for block in self._blocks], axis=0) / ratio
-        score = np.sum([block.score for block in self._blocks], axis=0) / ratio
-        precision = np.diag([1 / max(self._variances[named], 1e-30) for named in accepted])
-        return list(np.linalg.solve(directions.T @ whole @ directions + precision, directions.T @ score).tolist())
+    def drives_with(self, changes: Mapping[str, float]) -> None:
+        """Take it that the robot drives with changes of parameters from now on, which stretches then hold."""
+        names = self.hypotheses.names
+        self._driven_with = np.zeros(len(self._assumed))
+        for name, value in changes.items():
+            self._driven_with += value * self.hypotheses.directions[:, names.index(name)]
 
     def _flush(self) -> None:
         """Enter what waits, at the end of a run."""
@@ -917,7 +869,6 @@ class Guard:
         if self.hypotheses.names[named] == "reference_clock":
             self._delay += change
             self._state[3] += change
-        self._variances[named] = variance
         self._untold = self._untold + variance * direction[:, None] * direction
         verdict = self._verdict()
         self._usual_ratio = verdict.ratio

@@ -31,6 +31,82 @@ class SwapRecord(Model):
     at: float  # unix time, s
 
 
+Kind = Literal["change", "fault", "burst", "reference"]
+
+
+class Alarm(Model):
+    """What the guard tells: of a change or a fault its name, value and 95 % interval; of the others their size.
+
+    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low,
+    high: in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
+    detected_after_m: m that the wheels rolled between the two. alternatives: names that explain it nearly as well, of
+    which ``advice`` says how to tell them apart.
+    """
+
+    kind: Kind
+    name: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    unit: str
+    trajectory: str
+    t: float
+    since: str
+    since_t: float
+    detected_after_m: float
+    alternatives: tuple[str, ...] = ()
+    advice: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """The alarm in words: what, how much, or what else it may be and how to tell."""
+        size = "" if self.value is None else f" of {number_with_unit(self.value, self.unit)}"
+        if self.low is not None and self.high is not None:
+            size = f"{size.replace(' of', ' is')} ({self.low:.5g} to {self.high:.5g})"
+        if self.alternatives:
+            return f"{self.name}{size}, or {', '.join(self.alternatives)}: {self.advice}"
+        return f"{self.name}{size}"
+
+
+def number_with_unit(value: float, unit: str) -> str:
+    """A value with its unit; 1 is none."""
+    return f"{value:.5g}" + ("" if unit == "1" else f" {unit}")
+
+
+class HeldOut(Model):
+    """A proposal judged by motion after it was made. log_e: log of the likelihood ratio; ratio: of the errors."""
+
+    metres: float
+    log_e: float
+    error_ratio: float | None
+
+
+class Proposal(Model):
+    """A parameter with a new value, in shadow beside the calibration's. accepted: None while it is not decided."""
+
+    name: str
+    value: float
+    low: float | None = None
+    high: float | None = None
+    accepted: bool | None = None
+    rolled_back: bool = False
+    reason: str = ""
+    held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
+
+
+class GuardHealth(Model):
+    """What a robot's guard says. changed: it has told a change or a fault; message: the last of them. metres: watched.
+
+    alarms, proposals: the latest.
+    """
+
+    changed: bool
+    message: str
+    metres: float
+    alarms: tuple[Alarm, ...] = ()
+    proposals: tuple[Proposal, ...] = ()
+
+
 class Health(Model):
     """A robot's health, as the query ``health`` answers it.
 
@@ -56,10 +132,11 @@ class Health(Model):
     last_refusal: str
     last_swap: SwapRecord | None
     unfitted_motion_s: float | None = None
+    guard: GuardHealth | None = None
 
 
-def diagnostic(health: Health, hardware: str) -> Diagnostic:
-    """A health as a status of ``<robot>/diagnostics``."""
+def diagnostics(health: Health, hardware: str) -> tuple[Diagnostic, ...]:
+    """A health as the statuses of ``<robot>/diagnostics``: of odometry and, where there is one, of the guard."""
     values: dict[str, Any] = {
         "calibration": health.calibration,
         "rate_hz": f"{health.rate_hz:.1f}",
@@ -79,13 +156,19 @@ def diagnostic(health: Health, hardware: str) -> Diagnostic:
         values["last_refusal"] = health.last_refusal
     if health.last_swap is not None:
         values["last_swap"] = f"{'accepted' if health.last_swap.accepted else 'refused'}: {health.last_swap.reason}"
-    return Diagnostic(
+    odometry = Diagnostic(
         f"omnibench: {health.robot} odometry",
         _LEVELS[health.status],
         health.message,
         hardware,
         tuple((key, str(value)) for key, value in values.items()),
     )
+    if health.guard is None:
+        return (odometry,)
+    told = {f"{alarm.kind} {alarm.name}": f"{alarm.t:.3f} s" for alarm in health.guard.alarms}
+    values = {"metres": f"{health.guard.metres:.1f}"} | told
+    name, level = f"omnibench: {health.robot} guard", _LEVELS["degraded" if health.guard.changed else "ok"]
+    return odometry, Diagnostic(name, level, health.guard.message, hardware, tuple(values.items()))
 
 
 def _anomaly(words: str) -> Any:

@@ -27,7 +27,7 @@ from omnibench.errors import one_line, require_type
 from omnibench.live.config import LiveConfig, RobotConfig, robot_called
 from omnibench.live.control import QueryServer
 from omnibench.live.delivery import AcknowledgedFlows
-from omnibench.live.health import Counts, Health, anomalies_in_words, diagnostic
+from omnibench.live.health import Counts, Health, anomalies_in_words, diagnostics
 from omnibench.live.network import close_session, open_session
 from omnibench.live.presence import Claim
 from omnibench.live.record import Recorder, free_path
@@ -194,9 +194,11 @@ class RobotService:
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostics and log what has changed; called once a second."""
+        for alarm in self.tracker.watch():
+            LOG.warning("%s: guard: %s %s", self.tracker.name, alarm.kind, alarm.sentence)
         health = self.tracker.health(time.monotonic())
-        status = diagnostic(health, hardware=self.tracker.calibration.robot.name)
-        self._diagnostics.put(Diagnostics(time.time_ns(), (status,)))
+        statuses = diagnostics(health, hardware=self.tracker.calibration.robot.name)
+        self._diagnostics.put(Diagnostics(time.time_ns(), statuses))
         # Log a new status, and anomalies that were counted since they were last logged.
         if health.status != self._logged_status:
             self._logged_status = health.status
@@ -433,6 +435,7 @@ class LiveNode(Closing):
             wheels=robot.wheels,
             fusion=self.config.fusion_of(robot),
             frames=self.config.frames_of(robot),
+            guard=self.config.guard,
             stale_after=self.config.stale_after,
             memory=memory,
         )

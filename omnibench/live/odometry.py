@@ -144,6 +144,11 @@ class LiveOdometry:
         return self._stream.driven
 
     @property
+    def tracked_motion(self) -> Array:
+        """Motion (3,) of the tracked point in the last step, in its own frame, m, m, rad."""
+        return self._stream.moved
+
+    @property
     def covariance(self) -> Array:
         """Covariance (3, 3) of the pose, Eq. (L1)."""
         xx, xy, yy, xt, yt, tt = self._walk

@@ -35,7 +35,8 @@ from omnibench.live.fusion import (
     Timeline,
     predict,
 )
-from omnibench.live.health import Counts, FusionHealth, Health, Status, SwapRecord
+from omnibench.live.guarding import LiveGuard
+from omnibench.live.health import Alarm, Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.odometry import ExtrapolationMonitor, LiveOdometry, Motion
 from omnibench.live.state import RobotMemory, SavedState
 from omnibench.live.topics import Frames, JointStateDecoder, Update
@@ -101,7 +102,8 @@ class RobotTracker:
     """One robot: takes its samples and poses, and answers orders and questions.
 
     fusion: None for odometry alone. stale_after: s without wheel samples after which the stream counts as stale.
-    memory: where the state outlives the node. ConfigError: the joints that ``wheels`` names are not one for each wheel.
+    memory: where the state outlives the node. guard: watch for changes of the robot by the poses of SLAM; swap: drive
+    with those that are accepted. ConfigError: the joints that ``wheels`` names are not one for each wheel.
 
     calibration: the one that runs. counts: everything that was taken, refused or put right. refusals: number of
     messages that were refused for a reason. flows: flow of an acknowledged replay -> number of the next message that is
@@ -118,6 +120,7 @@ class RobotTracker:
         frames: Frames | None = None,
         stale_after: float = 0.5,
         memory: RobotMemory | None = None,
+        guard: bool | Literal["swap"] = False,
     ) -> None:
         self.name, self.calibration = name, calibration
         self.frames = frames or Frames()
@@ -139,6 +142,8 @@ class RobotTracker:
         self._fusion = Fusion(fusion, self._timeline, self.counts) if fusion else None
         self._pose_input = PoseInput(self.frames.map, settings, self.counts)
         self._reference = ReferenceCorrection(calibration.model)
+        self._guarding = guard if fusion else False
+        self._guard = LiveGuard(name, calibration) if self._guarding else None
         self._stamps = PublishedStamps()
         self._last_swap: SwapRecord | None = None
         self._memory = memory
@@ -188,6 +193,11 @@ class RobotTracker:
                 motion = odometry.step(step)
                 if self._monitor.seconds is not None:
                     self._monitor.take(step, odometry.driven)
+                if self._guard is not None:
+                    if step.blind or motion.restarted:
+                        self._guard.restart()
+                    else:
+                        self._guard.add(motion.stamp, motion.duration, odometry.tracked_motion, odometry.driven)
                 # 4. Predict the pose in the map.
                 if motion.restarted and timeline.entries:
                     # the clock jumped: the motion counts as if it ended at the new time, and times before it have no
@@ -229,7 +239,26 @@ class RobotTracker:
             except MessageError as error:
                 self._refused(str(error))
                 return None
-            return self._fusion.correct(self._reference.corrected(measurement))
+            measurement = self._reference.corrected(measurement)
+            if self._guard is not None:
+                self._guard.pose(measurement.stamp, measurement.pose, measurement.covariance)
+            return self._fusion.correct(measurement)
+
+    def watch(self) -> list[Alarm]:
+        """Let the guard judge what came since the last call, and drive with what it accepts if that is asked for.
+
+        The alarms that are new. It may take long, and nothing waits for it. For one thread.
+        """
+        guard = self._guard
+        if guard is None:
+            return []
+        with self._state_lock:
+            work = guard.take()
+        alarms = guard.judge(*work)
+        if self._guarding == "swap" and (changes := guard.changes_to_drive_with()) is not None:
+            self.swap(guard.guard.proposed(changes) or guard.guard.calibration, guard)
+            guard.drives_with(changes)
+        return alarms
 
     @property
     def fusing(self) -> bool:
@@ -281,6 +310,7 @@ class RobotTracker:
                 last_refusal=self._last_refusal,
                 last_swap=self._last_swap,
                 unfitted_motion_s=self._monitor.seconds,
+                guard=None if self._guard is None else self._guard.health(),
             )
 
     def _status(self, now: float, age: float | None, behind: float) -> tuple[Status, str]:
@@ -323,10 +353,10 @@ class RobotTracker:
                 raise DataError(f"at: {chosen / _SECOND:.6f} s is not within {oldest:.6f} to {newest:.6f} s")
             return PoseAt(chosen, odometry, self._fusion.at(chosen) if self._fusion else None)
 
-    def swap(self, calibration: Calibration) -> None:
+    def swap(self, calibration: Calibration, guard: LiveGuard | None = None) -> None:
         """Continue with another calibration from the next sample on; poses do not jump.
 
-        DataError: it is not this robot's, or cannot be run.
+        guard: the one that proposes it; else a new one watches. DataError: it is not this robot's, or cannot be run.
         """
         try:
             with self._state_lock:
@@ -335,6 +365,9 @@ class RobotTracker:
                 self._reference = ReferenceCorrection(calibration.model, self._reference.start)
                 self.calibration, self._odometry = calibration, odometry
                 self._monitor = ExtrapolationMonitor(self.name, calibration)
+                if self._guarding:
+                    self._guard = guard or LiveGuard(self.name, calibration)
+                    self._guard.restart()
                 self._guessed_angles = _wheel_angle_effects(calibration)
                 self.counts.swaps += 1
                 self._last_swap = SwapRecord(accepted=True, name=calibration.name, reason="runs", at=time.time())
@@ -358,6 +391,8 @@ class RobotTracker:
         """Forget the pose in the map; odometry continues. DataError without fusion."""
         with self._state_lock:
             self._required_fusion("reset").reset()
+            if self._guard is not None:
+                self._guard.restart()
             self._reference.start = None  # the next pose is the first of another run
 
     def resume(self, saved: SavedState, now: float, wall: float) -> None:

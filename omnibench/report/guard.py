@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from omnibench.live.guard import THRESHOLD, Alarm, Guard
-from omnibench.live.guard_recording import GuardReport
+from omnibench.live.guard import THRESHOLD, Guard
+from omnibench.live.guarding import GuardReport
+from omnibench.live.health import number_with_unit
 from omnibench.report.blocks import (
     Column,
     Document,
@@ -28,20 +29,6 @@ from omnibench.report.style import PALETTE, plot
 from omnibench.words import kind_of_data, plural
 
 _SHOWN = 6  # hypotheses that the picture shows; chosen
-
-
-def alarm_in_words(alarm: Alarm) -> str:
-    """An alarm as one sentence without a full stop: what, by how much, since when."""
-    size = "" if alarm.value is None else f" {_number(alarm.value, alarm.unit)}"
-    if alarm.low is not None and alarm.high is not None:
-        size = f" is {_number(alarm.value or 0.0, alarm.unit)} ({alarm.low:.5g} to {alarm.high:.5g})"
-    if alarm.alternatives:
-        return f"{alarm.name}{size}, or {', '.join(alarm.alternatives)}: {alarm.advice or 'no motion tells yet'}"
-    return f"{alarm.name}{size}"
-
-
-def _number(value: float, unit: str) -> str:
-    return f"{value:.5g}" + ("" if unit == "1" else f" {unit}")
 
 
 class GuardResult(Result):
@@ -67,7 +54,7 @@ class GuardResult(Result):
         driven = f"{report.metres:.0f} m of {self.dataset} ({kind_of_data(self.simulated)})"
         changes = [alarm for alarm in report.alarms if alarm.kind in ("change", "fault")]
         if changes:
-            return f"In {driven}: {'; '.join(map(alarm_in_words, changes))}."
+            return f"In {driven}: {'; '.join(alarm.sentence for alarm in changes)}."
         others = f"; {plural(len(report.alarms), 'passing event')}" if report.alarms else ""
         return f"Nothing changed in {driven}, as far as {self.file.name} states its noise{others}."
 
@@ -78,7 +65,7 @@ class GuardResult(Result):
             for alarm in self.report.alarms:
                 interval = "" if alarm.low is None or alarm.high is None else f"{alarm.low:.5g} to {alarm.high:.5g}"
                 told = f"{alarm.trajectory} {alarm.t:.1f} s"
-                value = "" if alarm.value is None else _number(alarm.value, alarm.unit)
+                value = "" if alarm.value is None else number_with_unit(alarm.value, alarm.unit)
                 cells = (alarm.kind, alarm.name, value, interval, told, f"{alarm.detected_after_m:.1f}")
                 rows.append(Row.of(*cells, ", ".join(alarm.alternatives)))
             words = (Column(title, numeric=False) for title in ("name", "value", "interval", "told in"))

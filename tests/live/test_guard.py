@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from guard_study import STEP, Drive, Truth, befallen, calibrated, commands, driven, watched
+from guard_study import STEP, Drive, Truth, befallen, calibrated, commands, driven, moving, watched
 from real_recordings import OPTIODOM
 
 import omnibench
 from omnibench.errors import DataError
 from omnibench.live.guard import Alarm, Guard
-from omnibench.live.guard_recording import watch_recording
+from omnibench.live.guarding import watch_recording
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import directions_of
@@ -88,7 +88,7 @@ def test_what_passes_is_told_as_such_and_changes_no_parameter(
 ) -> None:
     truth, calibration = robot
     drive = drive_of(truth)
-    start = CHANGED + int(np.argmax(np.abs(drive.signals[CHANGED:, 0]) > 4.0))
+    start = moving(drive, CHANGED)
     changed, slam = befallen(drive, what, start, np.random.default_rng(3))
     guard = told(calibration, changed, slam=slam)
     assert {alarm.kind for alarm in guard.alarms} == {kind}
@@ -138,11 +138,11 @@ def test_a_real_robot_shows_which_radius_of_its_calibration_is_wrong() -> None:
     assert not [alarm for alarm in right.alarms if alarm.kind == "change"]
     for name in ("radius_left", "radius_right"):
         wrong = changed_calibration(calibration, name, 0.01)
-        report, guard = watch_recording(wrong, dataset)
+        report, _ = watch_recording(wrong, dataset)
         assert [alarm.name for alarm in report.alarms if alarm.kind == "change"] == [name]
-        proposed = guard.proposed()
-        assert proposed is not None
-        before, after = (omnibench.evaluate(each, dataset).splits["all"].cost for each in (calibration, proposed))
+        assert report.proposed is not None
+        both = (calibration, report.proposed)
+        before, after = (omnibench.evaluate(each, dataset).splits["all"].cost for each in both)
         assert after < 1.1 * before
 
 

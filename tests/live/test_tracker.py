@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from omnibench.config import to_yaml
 from omnibench.errors import ConfigError, DataError
 from omnibench.live.fusion import FusionSettings
-from omnibench.live.health import Counts, anomalies_in_words, diagnostic
+from omnibench.live.health import Counts, anomalies_in_words, diagnostics
 from omnibench.live.odometry import ExtrapolationMonitor
 from omnibench.live.state import RobotMemory, SavedState
 from omnibench.live.topics import Update
@@ -412,14 +412,14 @@ def test_health_and_diagnostics_show_the_seconds_of_each_calibration(caplog: pyt
     feed(robot, SIDEWAYS, 3.0, 0.0)
     health = robot.health(3.0)
     assert health.unfitted_motion_s == pytest.approx(3.0, abs=0.1)
-    assert ("unfitted_motion_s", f"{health.unfitted_motion_s:.1f}") in diagnostic(health, "").values
+    assert ("unfitted_motion_s", f"{health.unfitted_motion_s:.1f}") in diagnostics(health, "")[0].values
     robot.swap(fitted(name="second", driven=(FORWARDS, SIDEWAYS)))
     feed(robot, SIDEWAYS, 3.0, 3.0 + PERIOD)
     assert robot.health(6.0).unfitted_motion_s == 0.0
     assert_warned_once(caplog)
     robot.swap(calibration())
     assert robot.health(6.0).unfitted_motion_s is None
-    assert "unfitted_motion_s" not in dict(diagnostic(robot.health(6.0), "").values)
+    assert "unfitted_motion_s" not in dict(diagnostics(robot.health(6.0), "")[0].values)
 
 
 # What a node remembers of a robot, on a real disk, and of the stamps that it has published.

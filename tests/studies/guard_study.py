@@ -225,6 +225,12 @@ EVENTS = {
 }
 
 
+def moving(drive: Drive, since: int) -> int:
+    """The first step from one on in which contact 0 begins two seconds at more than 1 rad/s."""
+    fast = np.abs(drive.signals[since:, 0]) > 1.0
+    return since + int(np.argmax(np.convolve(fast, np.ones(40), mode="valid") == 40))
+
+
 def befallen(drive: Drive, what: str, start: int, rng: np.random.Generator) -> tuple[Drive, Array]:
     """A drive that something befell at a step, and the poses that the reference then reports, without noise."""
     poses, signals = drive.poses.copy(), drive.signals.copy()
@@ -304,7 +310,7 @@ def main() -> None:
                 if what == "encoder" and kind == "swerve":
                     continue
                 drive = driven(truth, commands(kind, 300.0, rng), rng)
-                start = 2000 + int(np.argmax(np.abs(drive.signals[2000:, 0]) > 4.0))
+                start = moving(drive, 2000)
                 changed, slam = befallen(drive, what, start, rng)
                 guard, began = Guard(calibration), None
                 for number, metres in enumerate(watched(guard, changed, rng, slam), 1):
