@@ -256,9 +256,9 @@ def guard(
     while the robot drives: the radius of a wheel, the track, a steering zero, a slipping wheel, a silent encoder, the
     reference's scale, jumps and clock, the floor.
     """
+    from omnibench.cli.terminal.guard_result import GuardResult
     from omnibench.config import to_yaml
     from omnibench.live.guarding import watch_recording
-    from omnibench.report.guard import GuardResult
 
     shared.load_given_plugins(plugins)
     refuse_existing(output, force=force)

@@ -59,7 +59,7 @@ class LiveConfig(Model):
     fusion: FusionChoice = Field("none", description="of SLAM poses: none, ekf, or its settings")
     guard: bool | Literal["swap"] = Field(
         True,
-        description="on: watch for changes of the robot where poses are fused; swap: drive with those that are accepted, "
+        description="on: watch for changes of the robot where poses are fused; swap: drive with the accepted ones, "
         "until they turn out worse",
     )
     stale_after: Positive = Field(0.5, description="no wheel sample for so long makes the health stale, s")

@@ -332,9 +332,9 @@ class Guard:
         self._recent: deque[_Recent] = deque()
         self._squares: list[float] = []
         self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
-        self._usual_ratio = np.ones(len(self.hypotheses.names))
+        self._usual_ratio: Array = np.ones(len(self.hypotheses.names))
         told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _LEAST_STATED), _LONGEST_MEMORY)
-        self._freedom = np.full(len(self.hypotheses.names), float(told))
+        self._freedom: Array = np.full(len(self.hypotheses.names), float(told))
         self._alarm: int | None = None  # hypothesis of the alarm that is open
         self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
         self._kept: tuple[int, float, float] | None = None  # accepted: hypothesis, change, log of e of the old value
@@ -348,6 +348,7 @@ class Guard:
         self._state: Array = np.zeros(5)
         self._covariance: Array = np.zeros((5, 5))
         self._white: Array = np.zeros(3)
+        self._steady: tuple[Array, Array] = np.zeros(2), np.zeros((2, 2))
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
         """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""

@@ -8,12 +8,10 @@ from typing import Final
 
 import numpy as np
 from pydantic import Field
-from scipy.optimize import minimize_scalar
 
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError, require_type
-from omnibench.fit.evaluate import final_errors
 from omnibench.live.guard import LEAST_POSES, Guard, Stretch
 from omnibench.live.health import Alarm, GuardHealth, Proposal
 from omnibench.progress import Progress, Reporter, no_progress
@@ -45,6 +43,10 @@ def watch_recording(
 
     DataError: the wheels differ, no run has reference poses, or the recordings lack what an effect needs.
     """
+    from scipy.optimize import minimize_scalar
+
+    from omnibench.fit.evaluate import final_errors  # which a node does without
+
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")

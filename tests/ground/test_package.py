@@ -147,7 +147,7 @@ BELOW = {
     "design": {"robot", "data", "slam", "simulate", "fit", "report"},
     "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
     "discover": {"robot", "data", "simulate", "fit", "report"},
-    "live": {"robot", "data", "simulate"},
+    "live": {"robot", "data", "simulate", "fit"},
     "testing": {"robot", "data", "fit"},
 }
 BELOW["cli"] = {*BELOW, "testing"}

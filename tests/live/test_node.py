@@ -109,7 +109,8 @@ def test_diagnostics_come_once_a_second_with_the_counters(tmp_path: Path) -> Non
         until(lambda: len(heard["apr__diagnostics"]) >= 3, "three diagnostics")
     first, *_, last = heard["apr__diagnostics"]
     assert (last.stamp - first.stamp) / SECOND / (len(heard["apr__diagnostics"]) - 1) > 0.8
-    (status,) = last.statuses
+    status, guard = last.statuses
+    assert (guard.name, guard.level) == ("omnibench: apr guard", 0)
     assert status.name == "omnibench: apr odometry"
     assert status.level == 1
     assert dict(status.values)["undecodable"] == "1"
