@@ -97,6 +97,7 @@ _LONGEST_HISTORY: Final = 5000  # blocks; chosen
 _SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual; chosen
 _LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change; chosen
 _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
+_CLEAR: Final = 3.0  # standard deviations of a pose that a step has at least; chosen
 _LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
 _LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too; chosen
 _SCALES: Final = (1, 4, 16, 64)  # blocks that Birge's ratio joins, as slip may last; chosen
@@ -280,9 +281,10 @@ class _Sums:
 
 @dataclass(frozen=True, eq=False)
 class _Recent:
-    """A stretch that is not in a block yet: its sums, s, and the wheels whose encoders stood still."""
+    """A stretch that is not in a block yet: its sums, b (P,) unclipped, s, and wheels whose encoders stood still."""
 
     sums: _Sums
+    b: Array
     seconds: float
     still: tuple[int, ...]
 
@@ -331,6 +333,9 @@ class Guard:
         self._block: _Sums | None = None
         self._recent: deque[_Recent] = deque()
         self._squares: list[float] = []
+        self._slow_squares: deque[float] = deque(maxlen=_SQUARES)
+        self._stretches, self._slow = 0, 1.0
+        self._sum, self._sum_before = np.zeros(3), np.zeros(3)
         self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
         self._usual_ratio: Array = np.ones(len(self.hypotheses.names))
         told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _LEAST_STATED), _LONGEST_MEMORY)
@@ -343,6 +348,10 @@ class Guard:
         self._last_changed, self._changed_at = np.zeros(3), -math.inf
         self._steps_of: dict[int, int] = {}  # wheel -> steps in a row that are its own
         self._begun = False
+        self._steps: Array = np.zeros((0, 5, 3))
+        self._step_a: Array = np.zeros((0, 3, 3))
+        self._step_b: Array = np.zeros((0, 3))
+        self._step_clipped: Array = np.zeros((0, 3))
         self._open_at, self._told_at = 0, 0.0  # place of the open alarm, and the way when it was told, m
         self._shadow_from, self._shadow_errors = 0.0, (0.0, 0.0)
         self._state: Array = np.zeros(5)
@@ -366,7 +375,7 @@ class Guard:
         self._covariance[2, 4] = self._covariance[4, 2] = -variance
         self._covariance[4, 4] = variance
         self._deviation = np.zeros((5, len(self._assumed)))  # B of Eq. (G1)
-        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self._forget_steps()
         self._faster, self._white = np.zeros((3, 3)), np.zeros(3)
         self._steady = self._state[3:].copy(), self._covariance[3:, 3:].copy()
         self._begun = False
@@ -404,6 +413,7 @@ class Guard:
         self._steps = np.concatenate([transition @ self._steps, arrived])[-_RECENT:]
         self._step_a = np.concatenate([self._step_a, np.zeros((1, 3, 3))])[-_RECENT:]
         self._step_b = np.concatenate([self._step_b, np.zeros((1, 3))])[-_RECENT:]
+        self._step_clipped = np.concatenate([self._step_clipped, np.zeros((1, 3))])[-_RECENT:]
         # Measure.
         velocity = turn @ stretch.velocity
         measured = np.zeros((3, 5))
@@ -423,7 +433,14 @@ class Guard:
         # By differences from one to the next, in which what changed cancels out.
         white = np.linalg.solve(np.linalg.cholesky(spread), innovation)
         self._squares.append(float(np.square(white - self._white).sum()) / 2)
-        self._white = white
+        self._white, self._sum = white, self._sum + white
+        self._stretches += 1
+        if (
+            self._stretches % _RECENT == 0
+        ):  # nor are sums of several more than they say, if the reference does not drift
+            self._slow_squares.append(float(np.square(self._sum - self._sum_before).sum()) / (2 * _RECENT))
+            self._slow = max(1.0, float(np.median(self._slow_squares)) / _MEDIAN)
+            self._sum, self._sum_before = np.zeros(3), self._sum
         if len(self._squares) % _SQUARES == 0:  # a reference that scatters more than it says counts for less
             self._scale = max(1.0, self._scale * float(np.median(self._squares[-_SQUARES:])) / _MEDIAN)
             self._squares = self._squares[-_REMEMBERED:]
@@ -441,17 +458,19 @@ class Guard:
             whole,
             weight * (told @ innovation),
             np.einsum("ij,ji->i", told_along, along),
-            told_along @ innovation,
+            weight * (told_along @ innovation),
             np.zeros(len(self.hypotheses.names)),
             stretch.rolled,
             now,
         )
-        self._recent.append(_Recent(sums, stretch.seconds, stretch.still))
+        self._recent.append(_Recent(sums, told_along @ innovation, stretch.seconds, stretch.still))
         if self._quiet and len(self._recent) > _RECENT:
             self._recent.popleft()
         of_steps = measured @ self._steps
         self._step_a += np.swapaxes(of_steps, 1, 2) @ information @ of_steps
-        self._step_b += np.swapaxes(of_steps, 1, 2) @ (information @ innovation)
+        along_steps = np.swapaxes(of_steps, 1, 2) @ (information @ innovation)
+        self._step_b += along_steps
+        self._step_clipped += weight * along_steps
         state += gain @ innovation
         self._covariance -= gain @ measured @ self._covariance
         self._deviation -= gain @ slope
@@ -476,26 +495,32 @@ class Guard:
 
         The filter begins again at the pose, and nothing enters a block until it is sure that the step is over.
         """
-        tail = max(self._tail, self._ratio) * (1.0 if self._alarm is None else _CAREFUL)
+        tail = max(self._tail, self._slow, self._ratio) * (1.0 if self._alarm is None else _CAREFUL)
         regular = self._step_a + 1e-9 * np.eye(3)
-        steps = np.linalg.solve(regular, self._step_b[:, :, None])[:, :, 0]
-        gains = np.einsum("ij,ij->i", self._step_b, steps) / (2 * tail)
+        both = np.stack([self._step_b, self._step_clipped], axis=2)
+        steps, clipped = np.moveaxis(np.linalg.solve(regular, both), 2, 0)
+        # One pose that is far off is no step: each counts as much as a clipped one at most.
+        gains = np.einsum("ij,ij->i", self._step_clipped, clipped) / (2 * tail)
         at = int(gains.argmax())
         gain, step, reach = float(gains[at]), steps[at], max(self.predictor.reach, 0.1)
         size, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
-        if gain <= THRESHOLD or max(size, turned * reach) < _LEAST_STEP:
+        least = max(_LEAST_STEP, _CLEAR * math.sqrt((noise[0, 0] + noise[1, 1]) / 2))
+        if gain <= THRESHOLD or max(size, turned * reach) < least:
             return None
         if self._is_late(step):
             self._anchor(pose, noise)
             self._recent.clear()
             return []
-        # Changes since any of these stretches.
-        b, a = (np.cumsum([getattr(part.sums, name) for part in reversed(self._recent)], axis=0) for name in "ba")
-        rival = float((b * b / (2 * tail * np.maximum(a, 1e-12))).max())
-        if rival > gain - _APART or (gain < _SURE * THRESHOLD and rival > _PARTLY * gain):
-            return None
         parts = list(self._recent)[at - len(self._steps) :]
-        name, kind = self._name_step(parts, regular[at], self._step_b[at], gain * tail, size)
+        whole = float(self._step_b[at] @ step) / 2
+        name, kind = self._name_step(parts, regular[at], self._step_b[at], whole, size)
+        # Changes since any of these stretches; a silent encoder is none, however well they explain it.
+        b = np.cumsum([part.b for part in reversed(self._recent)], axis=0)
+        a = np.cumsum([part.sums.a for part in reversed(self._recent)], axis=0)
+        rival = float((b * b / (2 * np.maximum(a, 1e-12))).max())
+        rivals = rival > whole - _APART * tail or (whole < _SURE * THRESHOLD * tail and rival > _PARTLY * whole)
+        if rivals and not name.startswith("encoder_"):
+            return None
         since = parts[0].sums.since
         self._anchor(pose, noise)
         self._recent.clear()
@@ -525,6 +550,11 @@ class Guard:
         )
         self.alarms.append(alarm)
         return [alarm]
+
+    def _forget_steps(self) -> None:
+        self._steps, self._step_a, self._step_b, self._step_clipped = (
+            each[:0] for each in (self._steps, self._step_a, self._step_b, self._step_clipped)
+        )
 
     def _is_late(self, step: Array) -> bool:
         """True if a step is the rest of the way that the reference is late by, after the velocity changed."""
@@ -579,12 +609,11 @@ class Guard:
         self._covariance[2, 2] += (variance := float(self._covariance[4, 4]))
         self._covariance[2, 4] = self._covariance[4, 2] = -variance
         self._deviation[:] = 0.0
-        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self._forget_steps()
 
     def _enter(self) -> list[Alarm]:
         """Add the oldest stretch to the block, which is judged when it is long enough."""
         sums = self._recent.popleft().sums
-        sums.b = self.hypotheses.directions.T @ sums.score
         if self._block is None:
             self._block = sums
         else:
@@ -876,7 +905,7 @@ class Guard:
         self._freedom = np.minimum(self._freedom + sum(block.count for block in self._blocks), _LONGEST_MEMORY)
         self._blocks.clear()
         self._recent.clear()
-        self._steps, self._step_a, self._step_b = np.zeros((0, 5, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self._forget_steps()
         self._alarm, self._shadow = None, None
 
     def _assumed_along(self, named: int) -> float:
