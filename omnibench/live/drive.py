@@ -9,7 +9,7 @@ stands still. With S_i the start pose of run i in the drive and p(t) its referen
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -220,18 +220,24 @@ def _ordered(dataset: Dataset, split: Split | None) -> list[Trajectory]:
     chosen = dataset.trajectories if split is None else dataset.split(split)
     if not chosen:
         raise DataError(f"data set {dataset.name}: no run in split {split!r}; choose another split, or none")
-    sessions: dict[str | None, list[Trajectory]] = {}
     for run in chosen:
         if not run.has_poses:
             reason = "a single reference pose; it cannot be concatenated"
             if run.references is not None:
-                reason = "distances, turns and the like, and no poses; replay runs with poses, or others of --split"
+                reason = "no reference poses, but distances, turns and the like; replay runs with poses (--split)"
             raise DataError(f"data set {dataset.name}: run {run.id} has {reason}")
+    return list(map(_trimmed, in_order(chosen)))
+
+
+def in_order(runs: Iterable[Trajectory]) -> list[Trajectory]:
+    """Runs session by session, in each by their start where that is known of all."""
+    sessions: dict[str | None, list[Trajectory]] = {}
+    for run in runs:
         sessions.setdefault(run.session, []).append(run)
-    for runs in sessions.values():
-        if all(run.started_at is not None for run in runs):
-            runs.sort(key=lambda run: run.started_at or 0.0)
-    return [_trimmed(run) for runs in sessions.values() for run in runs]
+    for members in sessions.values():
+        if all(run.started_at is not None for run in members):
+            members.sort(key=lambda run: run.started_at or 0.0)
+    return [run for members in sessions.values() for run in members]
 
 
 def _trimmed(run: Trajectory) -> Trajectory:

@@ -46,20 +46,14 @@ def watch_recording(
     from scipy.optimize import minimize_scalar
 
     from omnibench.fit.evaluate import final_errors  # which a node does without
+    from omnibench.live.drive import in_order
 
     require_type(calibration, Calibration, "read_calibration")
     require_type(dataset, Dataset, "load_dataset")
     calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
-    sessions: dict[str | None, list[Trajectory]] = {}
-    for run in dataset.trajectories:
-        if run.has_poses and len(run.pose_times) > 1:
-            sessions.setdefault(run.session, []).append(run)
-    if not sessions:
+    ordered = in_order(run for run in dataset.trajectories if run.has_poses)
+    if not ordered:
         raise DataError(f"data set {dataset.name}: no run has two reference poses, between which motion is compared")
-    for runs in sessions.values():
-        if all(run.started_at is not None for run in runs):
-            runs.sort(key=lambda run: run.started_at or 0.0)
-    ordered = [run for runs in sessions.values() for run in runs]
     guard = Guard(calibration)
     for number, run in enumerate(ordered, 1):
         _watch_run(guard, run)

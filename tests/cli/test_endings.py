@@ -167,7 +167,7 @@ def test_an_output_can_be_written_short_or_long(name: str) -> None:
     for options in spellings:
         assert ("-o" in options) == ("--output" in options)
     writes = {"compare", "calibrate", "export", "discover", "import", "fetch", "design", "slam", "simulate", "record"}
-    assert any("-o" in options for options in spellings) == (name in {*writes, "example", "plugin new"})
+    assert any("-o" in options for options in spellings) == (name in {*writes, "example", "guard", "plugin new"})
 
 
 def test_the_version_is_printed_and_nothing_else(command: Command) -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import pytest
-from guard_study import STEP, Drive, Truth, befallen, calibrated, commands, driven, moving, watched
+from guard_study import HEADING, PLACE, STEP, Drive, Truth, befallen, calibrated, commands, driven, moving, watched
 from real_recordings import OPTIODOM
 
 import omnibench
+from omnibench.config import to_json
 from omnibench.errors import DataError
-from omnibench.live.guard import Alarm, Guard
+from omnibench.live.fusion import FusionSettings
+from omnibench.live.guard import Guard
 from omnibench.live.guarding import watch_recording
+from omnibench.live.health import Alarm, diagnostics
+from omnibench.live.tracker import RobotTracker
+from omnibench.live.wire import JOINT_STATE, POSE_ESTIMATE, JointState, PoseEstimate
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array
 from omnibench.robot.physical import directions_of
@@ -163,3 +169,46 @@ def test_the_json_of_an_alarm_has_the_fields_that_scripts_read() -> None:
     assert {"kind", "name", "value", "low", "high", "trajectory", "t", "detected_after_m", "alternatives"} <= set(
         json.loads(json.dumps(Alarm.model_json_schema()))["properties"]
     )
+
+
+def messages(drive: Drive) -> list[tuple[bool, bytes]]:
+    """The wheel samples of a differential drive and its SLAM poses, in CDR, in order; True for a pose."""
+    rng, every = np.random.default_rng(5), round(0.25 / STEP)
+    angles, stamp = np.cumsum(drive.rates * STEP, axis=0), 1_800_000_000 * 10**9
+    sent = []
+    for k in range(len(angles)):
+        at = stamp + round((k + 1) * STEP * 1e9)
+        sent.append((False, JOINT_STATE.encode(JointState(at, ("left", "right"), angles[k], drive.rates[k]))))
+        if (k + 1) % every == 0:
+            pose = drive.poses[k + 1] + np.array([PLACE, PLACE, HEADING]) * rng.standard_normal(3)
+            covariance = np.diag([PLACE**2, PLACE**2, HEADING**2])
+            sent.append((True, POSE_ESTIMATE.encode(PoseEstimate(at, "map", pose, covariance))))
+    return sent
+
+
+@pytest.mark.parametrize("guard", [True, "swap"])
+def test_a_node_tells_the_change_and_drives_with_it_where_the_config_says_so(guard: bool | Literal["swap"]) -> None:
+    rng = np.random.default_rng(4)
+    truth = Truth.drawn("differential", rng)
+    calibration = calibrated(truth, rng)
+    tracker = RobotTracker("apr", calibration, fusion=FusionSettings(), guard=guard)
+    changed = truth.changed("radius_left", -0.01)
+    told: list[Alarm] = []
+    for number, (is_pose, payload) in enumerate(messages(drive_of(truth, 250.0, then=changed))):
+        (tracker.take_pose if is_pose else tracker.take_wheels)(payload, number * STEP)
+        if number % 25 == 0:
+            told += tracker.watch()
+    assert [alarm.name for alarm in told] == ["radius_left"]
+    health = tracker.health(number * STEP)
+    assert health.guard is not None
+    assert health.guard.changed
+    assert "radius_left" in health.guard.message
+    odometry, status = diagnostics(health, "")
+    assert (odometry.level, status.level) == (0, 1)
+    matrix = tracker.calibration.matrix_array
+    if guard == "swap":
+        assert health.counts["swaps"] == 1
+        assert matrix[0, 0] / calibration.matrix_array[0, 0] == pytest.approx(0.99, abs=2e-3)
+    else:
+        assert tracker.calibration is calibration
+    json.loads(to_json(health))
