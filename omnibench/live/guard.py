@@ -47,13 +47,11 @@ from typing import Final
 
 import numpy as np
 
-from omnibench.errors import DataError
 from omnibench.live.health import Alarm, HeldOut, Kind, Proposal
 from omnibench.live.odometry import UNKNOWN_NOISE
+from omnibench.live.stretches import LEAST_STEP, Hypotheses, Predictor, Stretch
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array, CarDrive, pose_covariance, rotation
-from omnibench.robot.odometry import chord_shares
-from omnibench.robot.physical import directions_of, unit_of
+from omnibench.robot.kinematics import Array, pose_covariance, rotation
 
 _ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal; chosen
 _LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years; chosen
@@ -73,10 +71,7 @@ _LATEST: Final = 2.0  # s: no reference is later; chosen
 _RUNS: Final = 2.0  # runs for which that counts; chosen
 _OFFSET: Final = 0.003  # rad, least standard deviation of a reference's heading offset in a run; chosen
 _STRONG: Final = 0.04  # share of a radius: no tyre changes by more, but a wheel slips or its encoder errs; chosen
-_UNSTATED: Final = 0.002  # of each row's largest element: what a calibration without a covariance does not know; chosen
 LEAST_POSES: Final = 0.2  # s between two poses that are compared; chosen
-_LEAST_SLIP: Final = 1e-4  # rad and m per root metre: nothing rolls more exactly; chosen
-_NO_ANGLE: Final = 1e-9  # rad or m in a stretch: an encoder that stands still
 _CLIP: Final = 4.0  # of the norm of an innovation by its deviation: more counts as so much (Huber); chosen
 _SQUARES: Final = 32  # innovations of which the median is taken; chosen
 _REMEMBERED: Final = 256  # innovations whose tail is compared with that of normal ones; chosen
@@ -90,165 +85,16 @@ _PARTLY: Final = 0.6  # share of what a step explains: a change that explains as
 _MOSTLY: Final = 0.8  # share of a step that the motion of one wheel explains; chosen
 _CAREFUL: Final = 3.0  # times the threshold of a step while a change is settled; chosen
 _PERSISTENT: Final = 5  # steps of one wheel that are no burst any more; chosen
+_TURNS: Final = 1e-6  # rad/s: less is rounding
 _SAME_BURST: Final = 6.0  # s within which bursts are one; chosen
 _FIRST_TOLD: Final = ("trajectory", "t", "since", "since_t", "detected_after_m")  # fields that an alarm keeps
 _PASSING: Final = ("push", "slip", "reference_jump", "encoder_")
 _LONGEST_HISTORY: Final = 5000  # blocks; chosen
 _SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual; chosen
 _LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change; chosen
-_LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
 _CLEAR: Final = 3.0  # standard deviations of a pose that a step has at least; chosen
-_LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
 _LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too; chosen
 _SCALES: Final = (1, 4, 16, 64)  # blocks that Birge's ratio joins, as slip may last; chosen
-
-
-@dataclass(frozen=True, eq=False)
-class Hypotheses:
-    """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of its name.
-
-    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. untold (q, q):
-    covariance P of Eq. (G3).
-    """
-
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    units: tuple[str, ...]
-    values: Array
-    directions: Array
-    largest: Array
-    untold: Array
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> Hypotheses:
-        """The hypotheses on the robot of a calibration."""
-        robot, matrix = calibration.robot, calibration.matrix_array
-        size = matrix.size
-        count = size + 1
-        rows: list[tuple[str, Kind, str, float, Array]] = []
-        changes = directions_of(robot)
-        try:
-            known: Mapping[str, float] = {n: each.value for n, each in calibration.physical_parameters.items()}
-        except DataError:  # no wheels have this matrix
-            known = {}
-        for name, (design, change) in changes.items():
-            rows.append((name, "change", unit_of(name), known.get(name, design), change))
-        floor = np.sum([design * change for n, (design, change) in changes.items() if n.startswith("radius")], axis=0)
-        rows.append(("floor", "change", "1", 1.0, floor))
-        scale = (matrix * np.array([[1.0], [1.0], [0.0]])).ravel()
-        rows.append(("reference_scale", "reference", "1", 1.0, scale))
-        directions = np.zeros((count, len(rows) + 1))
-        directions[:size, : len(rows)] = np.column_stack([row[4] for row in rows])
-        directions[-1, -1] = 1.0
-        untold = np.zeros((count, count))
-        if calibration.covariance is None:
-            untold[:size, :size] = np.diag(np.repeat((_UNSTATED * robot.row_scales) ** 2, matrix.shape[1]))
-        else:
-            untold[:size, :size] = np.array(calibration.covariance)[:size, :size]
-        return cls(
-            (*(row[0] for row in rows), "reference_clock"),
-            (*(row[1] for row in rows), "reference"),
-            (*(row[2] for row in rows), "s"),
-            np.array([*(row[3] for row in rows), 0.0]),
-            directions,
-            np.array([*(_LARGEST_SHARE * _size(row) for row in rows), 3.0]),
-            untold,
-        )
-
-
-def _size(row: tuple[str, Kind, str, float, Array]) -> float:
-    """The size of a hypothesis's parameter: its value, or 1 rad."""
-    return 1.0 if row[2] == "rad" else abs(row[3])
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """The motion between two reference poses, as a calibration predicts it, in the robot's frame at its begin.
-
-    moved (3,): m, m, rad. slopes (3, q): its derivatives G. spread (3, 3): covariance that slip adds. rolled: m that
-    the wheels rolled in the mean. way: m that the tracked point went. seconds: it took. begun, velocity (3,): at its
-    begin and end, in the frame of its begin, m/s, m/s, rad/s. still: wheels that stood while others turned.
-    """
-
-    moved: Array
-    slopes: Array
-    spread: Array
-    rolled: float
-    way: float
-    seconds: float
-    begun: Array
-    velocity: Array
-    still: tuple[int, ...]
-
-
-class Predictor:
-    """Makes stretches of wheel samples, by a calibration's noise and geometry."""
-
-    def __init__(self, calibration: Calibration) -> None:
-        robot, noise, slip = calibration.robot, calibration.noise or UNKNOWN_NOISE, calibration.slip
-        self._robot = robot
-        self._arc = calibration.integration == "arc"
-        self.reach, self._matrix, self._radii = robot.reach, calibration.matrix_array, robot.radii
-        counts = [1] if isinstance(robot.drive, CarDrive) else [1 + wheel.has_steering for wheel in robot.measured]
-        self.columns = np.cumsum([0, *counts[:-1]])  # first column of each wheel
-        # Contacts slip independently, as much as turns the robot as its training runs were turned.
-        turning = math.sqrt(float(np.square(self._matrix[2] / self._of_wheel(self._radii)).sum()))
-        self._by_metre = slip is not None
-        walk = noise.walk_heading or UNKNOWN_NOISE.walk_heading
-        self._contact = max(walk if slip is None else slip.heading, _LEAST_SLIP) / max(turning, 1e-9)
-
-    def _of_wheel(self, values: Array) -> Array:
-        """Values (..., M) of the wheels of the drive signals, from those (..., N) of the wheels."""
-        signals = self._matrix.shape[1]
-        if self._robot.drive.direct:
-            return values
-        if isinstance(self._robot.drive, CarDrive):
-            return np.repeat(values.mean(axis=-1, keepdims=True), signals, axis=-1)
-        return np.repeat(values, [1 + wheel.has_steering for wheel in self._robot.measured], axis=-1)
-
-    def stretch(self, moved: Array, driven: Array, seconds: Array) -> Stretch:
-        """The stretch of n samples: motions (n, 3), integrals (n, M) of the drive signals, durations (n,), s."""
-        turn = moved[:, 2]
-        before = np.cumsum(turn) - turn
-        unit = np.exp(1j * (before + turn / 2)) * chord_shares(turn / 2) if self._arc else np.exp(1j * before)
-        steps = (moved[:, 0] + 1j * moved[:, 1]) * unit
-        after = np.cumsum(steps)
-        end = after[-1]
-        lever = end - after + steps / 2  # from the middle of each sample to the end
-        by_place, by_turn = unit @ driven, (1j * lever) @ driven
-        signals = driven.shape[1]
-        slopes = np.zeros((3, 3 * signals + 1))
-        by_row = slopes[:, : 3 * signals].reshape(3, 3, signals)
-        by_row[0] = by_place.real, -by_place.imag, by_turn.real
-        by_row[1] = by_place.imag, by_place.real, by_turn.imag
-        by_row[2, 2] = driven.sum(axis=0)
-        rolled = np.hypot(moved[:, 0], moved[:, 1]) + self.reach * np.abs(turn)
-        # Slip of each contact, and half as much of the place in all directions.
-        metres = (
-            np.abs(driven) * self._of_wheel(self._radii) if self._by_metre else np.repeat(seconds[:, None], signals, 1)
-        )
-        metres[rolled <= 0] = 0.0
-        carried = np.zeros((len(seconds), 3, 3))
-        carried[:, 0, 0] = carried[:, 1, 1] = unit.real
-        carried[:, 1, 0], carried[:, 0, 1] = unit.imag, -unit.imag
-        carried[:, 0, 2], carried[:, 1, 2], carried[:, 2, 2] = -lever.imag, lever.real, 1.0
-        slipping = carried @ (self._matrix / self._of_wheel(self._radii)) * np.sqrt(metres)[:, None]
-        slipping = np.swapaxes(slipping, 0, 1).reshape(3, -1)
-        spread = slipping @ slipping.T
-        spread[0, 0] += (anywhere := float(metres.mean(axis=1).sum()) / 4)
-        spread[1, 1] += anywhere
-        spread *= self._contact**2
-        duration = float(seconds.sum())
-        begun, velocity = (
-            np.array([steps[k].real, steps[k].imag, turn[k]]) / max(float(seconds[k]), 1e-9) for k in (0, -1)
-        )
-        whole = np.array([end.real, end.imag, turn.sum()])
-        way = float(np.abs(steps).sum())
-        metres = np.add.reduceat(np.abs(driven).sum(axis=0) * self._of_wheel(self._radii), self.columns)
-        still: tuple[int, ...] = ()
-        if metres.max() > _LEAST_STEP and metres.min() < _NO_ANGLE:
-            still = tuple(np.flatnonzero(metres < _NO_ANGLE).tolist())
-        return Stretch(whole, slopes, spread, float(rolled.sum()), way, duration, begun, velocity, still)
 
 
 @dataclass(frozen=True)
@@ -361,7 +207,7 @@ class Guard:
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
         """Begin a run at a reference pose (3,), m, m, rad, with its covariance (3, 3); None: the calibration's."""
-        self._flush()
+        self.end()
         self._quiet = 0
         if self._begun:  # delays that differ from run to run are no change of the reference
             self._delays.append(float(self._state[3]))
@@ -435,9 +281,7 @@ class Guard:
         self._squares.append(float(np.square(white - self._white).sum()) / 2)
         self._white, self._sum = white, self._sum + white
         self._stretches += 1
-        if (
-            self._stretches % _RECENT == 0
-        ):  # nor are sums of several more than they say, if the reference does not drift
+        if self._stretches % _RECENT == 0:  # sums of several are larger where the reference drifts
             self._slow_squares.append(float(np.square(self._sum - self._sum_before).sum()) / (2 * _RECENT))
             self._slow = max(1.0, float(np.median(self._slow_squares)) / _MEDIAN)
             self._sum, self._sum_before = np.zeros(3), self._sum
@@ -504,7 +348,7 @@ class Guard:
         at = int(gains.argmax())
         gain, step, reach = float(gains[at]), steps[at], max(self.predictor.reach, 0.1)
         size, turned = math.hypot(step[0], step[1]), abs(float(step[2]))
-        least = max(_LEAST_STEP, _CLEAR * math.sqrt((noise[0, 0] + noise[1, 1]) / 2))
+        least = max(LEAST_STEP, _CLEAR * math.sqrt((noise[0, 0] + noise[1, 1]) / 2))
         if gain <= THRESHOLD or max(size, turned * reach) < least:
             return None
         if self._is_late(step):
@@ -623,8 +467,10 @@ class Guard:
         return self._judge()
 
     def end(self) -> None:
-        """Judge what waits, at the end of the last run."""
-        self._flush()
+        """Judge what waits, at the end of a run."""
+        while self._recent and not self._quiet:
+            self._enter()
+        self._recent.clear()
 
     @property
     def accepted(self) -> dict[str, float]:
@@ -663,11 +509,6 @@ class Guard:
         for name, value in changes.items():
             self._driven_with += value * self.hypotheses.directions[:, names.index(name)]
 
-    def _flush(self) -> None:
-        """Enter what waits, at the end of a run."""
-        while self._recent:
-            self._enter()
-
     def _judge(self) -> list[Alarm]:
         """Close the block; judge all of them, the alarm that is open, and what is in shadow."""
         block, self._block = self._block, None
@@ -697,8 +538,7 @@ class Guard:
         count = len(self._blocks)
         a, b, scatter = (np.array([getattr(block, name) for block in self._blocks]) for name in ("a", "b", "scatter"))
         numbers = np.array([block.count for block in self._blocks])
-        firsts = list(range(count))
-        ratios = np.full((len(firsts), a.shape[1]), _LEAST_RATIO)
+        ratios = np.full((count, a.shape[1]), _LEAST_RATIO)
         freedom = self._freedom + max(int(numbers.sum()) - 2, 0)
         for scale in _SCALES:
             places = (np.cumsum(numbers) - numbers) // scale
@@ -708,27 +548,23 @@ class Guard:
             groups = sizes if scale == 1 else np.ones(len(edges))
             before = _scatter_within(ga, gb, within, groups)
             after = [row[::-1] for row in _scatter_within(ga[::-1], gb[::-1], within[::-1], groups[::-1])]
-            for row, first in enumerate(firsts):
+            stated = np.maximum(self._freedom / scale, _LEAST_STATED)
+            for first in range(count):
                 right = int(np.searchsorted(edges, first))  # groups wholly after, and wholly before
                 left = right if right < len(edges) and edges[right] == first else max(right - 1, 0)
                 squares, free = before[0][left] + after[0][right], before[1][left] + after[1][right]
-                stated = np.maximum(self._freedom / scale, _LEAST_STATED)
                 ratio = (stated * self._usual_ratio + squares) / (stated + free)
-                ratios[row] = np.maximum(ratios[row], ratio)
+                ratios[first] = np.maximum(ratios[first], ratio)
         # What the blocks before tell of what the calibration does not know, and what is left of it.
-        wholes, scores = (
-            np.cumsum(
-                [np.zeros_like(getattr(self._blocks[0], name)), *(getattr(each, name) for each in self._blocks)], 0
-            )
-            for name in ("whole", "score")
-        )
+        wholes = np.cumsum([0 * self._untold, *(block.whole for block in self._blocks)], axis=0)
+        scores = np.cumsum([0 * self._untold[0], *(block.score for block in self._blocks)], axis=0)
         common = np.median(ratios, axis=1)
         identity, untold = np.eye(len(self._untold)), self._untold
-        before = wholes[firsts] / common[:, None, None]
+        before = wholes[:-1] / common[:, None, None]
         known = np.linalg.solve(identity + untold @ before, np.broadcast_to(untold, before.shape))
-        whole = (wholes[-1] - wholes[firsts]) / common[:, None, None]
-        score = (scores[-1] - scores[firsts]) / common[:, None]
-        mean = (known @ (scores[firsts] / common[:, None])[:, :, None])[:, :, 0]
+        whole = (wholes[-1] - wholes[:-1]) / common[:, None, None]
+        score = (scores[-1] - scores[:-1]) / common[:, None]
+        mean = (known @ (scores[:-1] / common[:, None])[:, :, None])[:, :, 0]
         score -= (whole @ mean[:, :, None])[:, :, 0]
         known = known + _WANDERING * (untold - known)
         joint = np.linalg.solve(identity + whole @ known, np.concatenate([whole, score[:, :, None]], axis=2))
@@ -741,45 +577,43 @@ class Guard:
         h[np.abs(slope / along) > self.hypotheses.largest] = 0.0
         row = int(h.max(axis=1).argmax())
         deviation = np.sqrt(1 / along[row] / shrunk[row])
-        return _Verdict(h[row], slope[row] / along[row], deviation, ratios[row], firsts[row])
+        return _Verdict(h[row], slope[row] / along[row], deviation, ratios[row], row)
 
     def _tell(self, verdict: _Verdict) -> list[Alarm]:
         """Tell a change, or more of the one that is open; propose its value, and go on from it when it is settled."""
         best, hypotheses = verdict.best, self.hypotheses
-        since = self._blocks[verdict.first].since
-        now = self._blocks[-1].since
-        told = self._alarm is not None
+        since, told = self._blocks[verdict.first].since, self._alarm is not None
         if verdict.h[best] > THRESHOLD or not told:
             alarm = self._alarm_of(verdict, since)
             if told:
-                first = self.alarms[self._open_at]
-                kept = {name: getattr(first, name) for name in _FIRST_TOLD}
-                changed = alarm.model_copy(update=kept)
-                self.alarms[self._open_at] = alarm = changed
+                self._retell(alarm)
             else:
                 self._open_at, self._told_at = len(self.alarms), self.metres
                 self.alarms.append(alarm)
             self._alarm = best
-        else:
-            alarm = self.alarms[self._open_at]
+        alarm = self.alarms[self._open_at]
         assert self._alarm is not None
-        named, change, variance = self._alarm, float(verdict.change[self._alarm]), 0.0
+        named, change = self._alarm, float(verdict.change[self._alarm])
         variance = float(verdict.deviation[named]) ** 2
         proposable = alarm.kind == "change" and hypotheses.names[named] != "floor" and not alarm.alternatives
         if proposable and self._shadow is None:
-            value = float(hypotheses.values[named] + self._assumed_along(named) + change)
+            value = float(hypotheses.values[named] + self._adopted.get(named, 0.0) + change)
             self.proposals.append(Proposal(name=hypotheses.names[named], value=value))
             self._shadow = (named, change, variance, 0.0)
             self._shadow_from, self._shadow_errors = self.metres, (0.0, 0.0)
         elif not proposable and not alarm.alternatives and self.metres - self._told_at > _SETTLED:
             self._adopt(named, change, variance)
-        del now
         return [alarm]
+
+    def _retell(self, alarm: Alarm) -> None:
+        """Say of the open alarm what is known by now; when it was told first stays."""
+        first = self.alarms[self._open_at]
+        self.alarms[self._open_at] = alarm.model_copy(update={name: getattr(first, name) for name in _FIRST_TOLD})
 
     def _alarm_of(self, verdict: _Verdict, since: Moment) -> Alarm:
         best, hypotheses, now = verdict.best, self.hypotheses, self._blocks[-1].since
         name, kind = hypotheses.names[best], hypotheses.kinds[best]
-        value = float(hypotheses.values[best] + self._assumed_along(best) + verdict.change[best])
+        value = float(hypotheses.values[best] + self._adopted.get(best, 0.0) + verdict.change[best])
         reach = 1.96 * float(verdict.deviation[best])
         if kind == "change" and name.startswith("radius_"):
             share = float(verdict.change[best]) / hypotheses.values[best]
@@ -820,13 +654,9 @@ class Guard:
         if not np.max(differences) > 0:
             return "no motion tells them apart"
         motion = motions[int(np.min(differences, axis=0).argmax())]
-        return (
-            "turn on the spot"
-            if abs(motion[2]) > 1e-6
-            else "drive sideways"
-            if abs(motion[1]) > 0.5
-            else "drive straight"
-        )
+        if abs(motion[2]) > _TURNS:
+            return "turn on the spot"
+        return "drive sideways" if abs(motion[1]) > abs(motion[0]) else "drive straight"
 
     def _weigh(self, block: _Sums, verdict: _Verdict) -> None:
         """Judge what is in shadow, and what was accepted, by a new block."""
@@ -852,12 +682,10 @@ class Guard:
                 self._note(accepted=accepted, reason=reason)
                 if accepted:
                     refined, deviation = float(verdict.change[named]), float(verdict.deviation[named])
-                    value = float(self.hypotheses.values[named] + self._assumed_along(named) + refined)
+                    value = float(self.hypotheses.values[named] + self._adopted.get(named, 0.0) + refined)
                     interval = {"low": value - 1.96 * deviation, "high": value + 1.96 * deviation}
                     self.proposals[-1] = self.proposals[-1].model_copy(update={"value": value, **interval})
-                    told = self._alarm_of(verdict, self._blocks[verdict.first].since)
-                    kept = {name: getattr(self.alarms[self._open_at], name) for name in _FIRST_TOLD}
-                    self.alarms[self._open_at] = told.model_copy(update=kept)
+                    self._retell(self._alarm_of(verdict, self._blocks[verdict.first].since))
                     self._adopt(named, refined, deviation**2)
                     self._kept = (named, refined, 0.0)
                 else:
@@ -866,9 +694,8 @@ class Guard:
                 self._note(accepted=None, reason="")
         elif self._kept is not None:
             named, change, evidence = self._kept
-            evidence += (-change * float(block.b[named]) - change**2 * float(block.a[named]) / 2) / float(
-                verdict.ratio[named]
-            )
+            loss = change * float(block.b[named]) + change**2 * float(block.a[named]) / 2
+            evidence -= loss / float(verdict.ratio[named])
             self._kept = (named, change, evidence)
             if evidence > level:
                 self.proposals[-1] = self.proposals[-1].model_copy(
@@ -907,10 +734,6 @@ class Guard:
         self._recent.clear()
         self._forget_steps()
         self._alarm, self._shadow = None, None
-
-    def _assumed_along(self, named: int) -> float:
-        """The part of what was adopted that is this hypothesis's, in its unit."""
-        return self._adopted.get(named, 0.0)
 
 
 def _rows(matrix: Array, change: Array) -> tuple[tuple[float, ...], ...]:

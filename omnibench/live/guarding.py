@@ -12,8 +12,9 @@ from pydantic import Field
 from omnibench.config import Model
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.errors import DataError, require_type
-from omnibench.live.guard import LEAST_POSES, Guard, Stretch
+from omnibench.live.guard import LEAST_POSES, Guard
 from omnibench.live.health import Alarm, GuardHealth, Proposal
+from omnibench.live.stretches import Stretch
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import ReferenceEffect
