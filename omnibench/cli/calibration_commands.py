@@ -269,7 +269,7 @@ def guard(
     written = None
     if output is not None and report.proposed is not None:
         write_text(written := output, to_yaml(report.proposed))
-    result = GuardResult(report, watching, recordings.name, recordings.simulated, calibration, dataset, written)
+    result = GuardResult(report, watching, recordings.name, recordings.simulated, calibration, dataset, written, output)
     page.write(result.page, announced=True)
     show(result, as_json)
 

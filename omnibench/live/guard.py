@@ -24,16 +24,18 @@ freedom, n0 of which stand for the calibration's word,
 
     h = (n + 1)/2 log(1 + T / (l n))                                                                             (G4)
 
-takes the place of T/2. A change is told when h exceeds log(looks / alpha), which bounds false alarms by alpha over all
-looks; hypotheses whose h is within log(100) of the best are alternatives to it.
+takes the place of T/2, and where the tail of Student's t is heavier, minus its logarithm. A change is told when h
+exceeds log(looks / alpha): false alarms have the probability alpha or so over all looks. Hypotheses whose h is within
+log(100) of the best are alternatives to it.
 
 One block's estimate is wrong where the robot was pushed, a wheel slipped on an edge, or the reference jumped: a step of
 the pose at one stretch that explains the last innovations better than any change. It is told as such, the filter goes
 on from there, and nothing of it enters a block.
 
 A proposal is the changed parameter with its new value. Blocks that come later decide between it and the old one by the
-likelihood ratio, an e-value (Grunwald et al., JRSS B 86:1091, 2024): the k-th proposal is accepted at an error of
-alpha / (k (k + 1)), over all looks, and rolled back when the ratio speaks against it later.
+likelihood ratio against the calibration's value, an e-value (Grunwald et al., JRSS B 86:1091, 2024) as far as Birge's
+ratio is right: the k-th proposal is accepted at an error of alpha / (k (k + 1)), and rolled back when the ratio speaks
+against it later.
 """
 
 from __future__ import annotations
@@ -46,12 +48,13 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from scipy.special import stdtr
 
 from omnibench.live.health import Alarm, HeldOut, Kind, Proposal
 from omnibench.live.odometry import UNKNOWN_NOISE
 from omnibench.live.stretches import LEAST_STEP, Hypotheses, Predictor, Stretch
 from omnibench.robot.calibration import Calibration
-from omnibench.robot.kinematics import Array, pose_covariance, rotation
+from omnibench.robot.kinematics import Array, CarDrive, pose_covariance, rotation
 
 _ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal; chosen
 _LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years; chosen
@@ -85,6 +88,7 @@ _PARTLY: Final = 0.6  # share of what a step explains: a change that explains as
 _MOSTLY: Final = 0.8  # share of a step that the motion of one wheel explains; chosen
 _CAREFUL: Final = 3.0  # times the threshold of a step while a change is settled; chosen
 _PERSISTENT: Final = 5  # steps of one wheel that are no burst any more; chosen
+_ALIKE_EFFECT: Final = 0.01  # share of what a change does: less tells it from no other; chosen
 _TURNS: Final = 1e-6  # rad/s: less is rounding
 _SAME_BURST: Final = 6.0  # s within which bursts are one; chosen
 _FIRST_TOLD: Final = ("trajectory", "t", "since", "since_t", "detected_after_m")  # fields that an alarm keeps
@@ -127,9 +131,10 @@ class _Sums:
 
 @dataclass(frozen=True, eq=False)
 class _Recent:
-    """A stretch that is not in a block yet: its sums, b (P,) unclipped, s, and wheels whose encoders stood still."""
+    """A stretch that is not in a block yet: its sums, a and b (P,) unclipped, s, wheels whose encoders stood still."""
 
     sums: _Sums
+    a: Array
     b: Array
     seconds: float
     still: tuple[int, ...]
@@ -164,6 +169,7 @@ class Guard:
         noise = calibration.noise or UNKNOWN_NOISE
         place = max(noise.pose_position, _LEAST_PLACE)
         self._usual = pose_covariance(place, math.degrees(max(noise.pose_heading, _LEAST_HEADING)))
+        self._least = np.diag([_LEAST_PLACE, _LEAST_PLACE, _LEAST_HEADING]) ** 2
         self._offset = max(noise.bias_heading, _OFFSET)
         self.alarms: list[Alarm] = []
         self.proposals: list[Proposal] = []
@@ -172,7 +178,7 @@ class Guard:
         count = len(self.hypotheses.untold)
         self._untold = self.hypotheses.untold.copy()
         self._assumed, self._driven_with, self._delay = np.zeros(count), np.zeros(count), 0.0
-        self._delays: list[float] = []  # of the runs so far
+        self._delays: deque[float] = deque(maxlen=_LONGEST_HISTORY)  # of the runs so far
         self._delay_variance = _DELAY**2
         self._adopted: dict[int, float] = {}  # hypothesis -> change
         self._blocks: list[_Sums] = []
@@ -188,7 +194,9 @@ class Guard:
         self._freedom: Array = np.full(len(self.hypotheses.names), float(told))
         self._alarm: int | None = None  # hypothesis of the alarm that is open
         self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
-        self._kept: tuple[int, float, float] | None = None  # accepted: hypothesis, change, log of e of the old value
+        self._kept: dict[
+            int, tuple[int, float, float]
+        ] = {}  # accepted: hypothesis, change, log of e
         self._ratio = 1.0
         self._last_step, self._quiet = -math.inf, 0
         self._last_changed, self._changed_at = np.zeros(3), -math.inf
@@ -203,6 +211,7 @@ class Guard:
         self._state: Array = np.zeros(5)
         self._covariance: Array = np.zeros((5, 5))
         self._white: Array = np.zeros(3)
+        self._velocity: Array = np.zeros(3)
         self._steady: tuple[Array, Array] = np.zeros(2), np.zeros((2, 2))
 
     def begin(self, pose: Array, covariance: Array | None = None) -> None:
@@ -214,7 +223,7 @@ class Guard:
             self._spread_of_delays()
         self._state = np.array([*pose.tolist(), self._delay, 0.0])
         self._covariance = np.zeros((5, 5))
-        self._covariance[:3, :3] = self._usual if covariance is None else covariance
+        self._covariance[:3, :3] = self._usual if covariance is None else covariance + self._least
         self._covariance[3, 3] = self._delay_variance
         variance = self._offset**2
         self._covariance[2, 2] += variance
@@ -241,10 +250,7 @@ class Guard:
         turn = rotation(heading)
         slopes = turn @ stretch.slopes
         if not self._begun:  # what the reference tells of a robot that moves already is late
-            first = turn @ stretch.begun
-            delayed = np.array([*first.tolist(), 1.0, 0.0])
-            self._covariance[3, 3] = 0.0
-            self._covariance += self._delay_variance * delayed[:, None] * delayed
+            self._be_late(turn @ stretch.begun)
             self._begun = True
         moved = turn @ stretch.moved + slopes @ (self._assumed - self._driven_with)
         state[:3] += moved
@@ -261,12 +267,12 @@ class Guard:
         self._step_b = np.concatenate([self._step_b, np.zeros((1, 3))])[-_RECENT:]
         self._step_clipped = np.concatenate([self._step_clipped, np.zeros((1, 3))])[-_RECENT:]
         # Measure.
-        velocity = turn @ stretch.velocity
+        self._velocity = velocity = turn @ stretch.velocity
         measured = np.zeros((3, 5))
         measured[:, :3], measured[:, 3], measured[2, 4] = np.eye(3), -velocity, 1.0
         innovation = pose - measured @ state
         innovation[2] -= math.tau * round(float(innovation[2]) / math.tau)
-        noise = self._usual if covariance is None else covariance
+        noise = self._usual if covariance is None else covariance + self._least
         faster = turn @ (stretch.velocity - stretch.begun)  # a delay shows while the velocity changes, in part
         spread = measured @ self._covariance @ measured.T + self._scale * noise
         self._moving = speed > _FASTER
@@ -298,16 +304,17 @@ class Guard:
         told_along = along.T @ information
         whole = told @ slope
         now = Moment(*at, self.metres)
-        sums = _Sums(
-            whole,
+        a = np.einsum("ij,ji->i", told_along, along)
+        sums = _Sums(  # what is clipped tells less
+            weight * whole,
             weight * (told @ innovation),
-            np.einsum("ij,ji->i", told_along, along),
+            weight * a,
             weight * (told_along @ innovation),
             np.zeros(len(self.hypotheses.names)),
             stretch.rolled,
             now,
         )
-        self._recent.append(_Recent(sums, told_along @ innovation, stretch.seconds, stretch.still))
+        self._recent.append(_Recent(sums, a, told_along @ innovation, stretch.seconds, stretch.still))
         if self._quiet and len(self._recent) > _RECENT:
             self._recent.popleft()
         of_steps = measured @ self._steps
@@ -359,8 +366,7 @@ class Guard:
         whole = float(self._step_b[at] @ step) / 2
         name, kind = self._name_step(parts, regular[at], self._step_b[at], whole, size)
         # Changes since any of these stretches; a silent encoder is none, however well they explain it.
-        b = np.cumsum([part.b for part in reversed(self._recent)], axis=0)
-        a = np.cumsum([part.sums.a for part in reversed(self._recent)], axis=0)
+        b, a = (np.cumsum([getattr(part, name) for part in reversed(self._recent)], axis=0) for name in "ba")
         rival = float((b * b / (2 * np.maximum(a, 1e-12))).max())
         rivals = rival > whole - _APART * tail or (whole < _SURE * THRESHOLD * tail and rival > _PARTLY * whole)
         if rivals and not name.startswith("encoder_"):
@@ -372,7 +378,8 @@ class Guard:
         value, unit = (size, "m") if size > turned * reach else (turned, "rad")
         before = self.alarms[-1] if self.alarms and self.seconds - self._last_step < _SAME_BURST else None
         self._last_step = self.seconds
-        if before is not None and before.name.startswith(_PASSING):  # it goes on
+        is_open = self._alarm is not None and self._open_at == len(self.alarms) - 1
+        if before is not None and before.name.startswith(_PASSING) and not is_open:  # it goes on
             began = Moment(before.since, before.since_t, now.metres - before.detected_after_m)
             value += (before.value or 0.0) if unit == before.unit else 0.0
             if before.kind != "reference" and kind != "fault":
@@ -432,7 +439,7 @@ class Guard:
         if silent is not None and explained[silent] > _MOSTLY * gain:
             return f"encoder_{self.calibration.robot.wheel_names[silent]}", "fault"
         wheel = int(np.argmax(explained))
-        if explained[wheel] > _MOSTLY * gain:
+        if explained[wheel] > _MOSTLY * gain and len(explained) == len(self.calibration.robot.wheel_names):
             self._steps_of[wheel] = self._steps_of.get(wheel, 0) + 1
             if self._steps_of[wheel] > _PERSISTENT:
                 return f"slip_{self.calibration.robot.wheel_names[wheel]}", "fault"
@@ -453,7 +460,15 @@ class Guard:
         self._covariance[2, 2] += (variance := float(self._covariance[4, 4]))
         self._covariance[2, 4] = self._covariance[4, 2] = -variance
         self._deviation[:] = 0.0
+        self._be_late(self._velocity)
         self._forget_steps()
+
+    def _be_late(self, velocity: Array) -> None:
+        """Correct a pose that was taken as it was measured for the delay, at a velocity (3,) in the map."""
+        delayed = np.array([*velocity.tolist(), 1.0, 0.0])
+        variance, self._covariance[3, 3] = float(self._covariance[3, 3]), 0.0
+        self._covariance += variance * delayed[:, None] * delayed
+        self._state[:3] += velocity * self._state[3]
 
     def _enter(self) -> list[Alarm]:
         """Add the oldest stretch to the block, which is judged when it is long enough."""
@@ -501,6 +516,11 @@ class Guard:
                     known[name] = parameter.model_copy(update=update)
             changed["parameters"] = known
         return calibration.model_copy(update=changed)
+
+    @property
+    def settled(self) -> bool:
+        """True if no alarm is open."""
+        return self._alarm is None
 
     def drives_with(self, changes: Mapping[str, float]) -> None:
         """Take it that the robot drives with changes of parameters from now on, which stretches then hold."""
@@ -555,6 +575,8 @@ class Guard:
                 squares, free = before[0][left] + after[0][right], before[1][left] + after[1][right]
                 ratio = (stated * self._usual_ratio + squares) / (stated + free)
                 ratios[first] = np.maximum(ratios[first], ratio)
+        # A reference that drifts errs at the ends of a window, however long that is.
+        ratios *= 1 + (self._slow - 1) / numbers[::-1].cumsum()[::-1, None]
         # What the blocks before tell of what the calibration does not know, and what is left of it.
         wholes = np.cumsum([0 * self._untold, *(block.whole for block in self._blocks)], axis=0)
         scores = np.cumsum([0 * self._untold[0], *(block.score for block in self._blocks)], axis=0)
@@ -574,6 +596,9 @@ class Guard:
         along = np.maximum(along, 1e-12)
         shrunk = np.minimum(common[:, None] / ratios, 1.0)
         h = (freedom + 1) / 2 * np.log1p(shrunk * slope**2 / along / freedom)
+        # With few degrees of freedom the tail of Student's t is heavier than that.
+        tail = 2 * stdtr(np.broadcast_to(freedom, h.shape), -np.sqrt(shrunk * slope**2 / along))
+        h = np.minimum(h, -np.log(np.maximum(tail, np.finfo(float).tiny)))
         h[np.abs(slope / along) > self.hypotheses.largest] = 0.0
         row = int(h.max(axis=1).argmax())
         deviation = np.sqrt(1 / along[row] / shrunk[row])
@@ -598,7 +623,7 @@ class Guard:
         proposable = alarm.kind == "change" and hypotheses.names[named] != "floor" and not alarm.alternatives
         if proposable and self._shadow is None:
             value = float(hypotheses.values[named] + self._adopted.get(named, 0.0) + change)
-            self.proposals.append(Proposal(name=hypotheses.names[named], value=value))
+            self.proposals.append(Proposal(name=hypotheses.names[named], value=value, since=alarm.since))
             self._shadow = (named, change, variance, 0.0)
             self._shadow_from, self._shadow_errors = self.metres, (0.0, 0.0)
         elif not proposable and not alarm.alternatives and self.metres - self._told_at > _SETTLED:
@@ -642,20 +667,22 @@ class Guard:
         size = self.calibration.matrix_array.size
         motions = self.calibration.robot.motions
         signals = np.linalg.pinv(self.calibration.robot.centre_matrix) @ motions.T
-        differences = []
-        for other in others:
-            change = (
-                self.hypotheses.directions[:size, best] * verdict.change[best]
-                - self.hypotheses.directions[:size, other] * verdict.change[other]
-            )
-            moved = change.reshape(3, -1) @ signals
-            moved[2] *= max(self.predictor.reach, 0.1)
-            differences.append(np.linalg.norm(moved, axis=0) / np.maximum(np.linalg.norm(motions[:, :2], axis=1), 0.1))
-        if not np.max(differences) > 0:
+        reach, sizes = max(self.predictor.reach, 0.1), np.maximum(np.linalg.norm(motions[:, :2], axis=1), 0.1)
+
+        def effect(hypothesis: int) -> Array:
+            """What a change does to each motion (3, D), m."""
+            change = self.hypotheses.directions[:size, hypothesis] * verdict.change[hypothesis]
+            moved: Array = change.reshape(3, -1) @ signals
+            moved[2] *= reach
+            return moved / sizes
+
+        own = effect(best)
+        apart = np.min([np.linalg.norm(own - effect(other), axis=0) for other in others], axis=0)
+        if not apart.max() > _ALIKE_EFFECT * np.linalg.norm(own):
             return "no motion tells them apart"
-        motion = motions[int(np.min(differences, axis=0).argmax())]
+        motion = motions[int(apart.argmax())]
         if abs(motion[2]) > _TURNS:
-            return "turn on the spot"
+            return "drive a curve" if isinstance(self.calibration.robot.drive, CarDrive) else "turn on the spot"
         return "drive sideways" if abs(motion[1]) > abs(motion[0]) else "drive straight"
 
     def _weigh(self, block: _Sums, verdict: _Verdict) -> None:
@@ -687,22 +714,21 @@ class Guard:
                     self.proposals[-1] = self.proposals[-1].model_copy(update={"value": value, **interval})
                     self._retell(self._alarm_of(verdict, self._blocks[verdict.first].since))
                     self._adopt(named, refined, deviation**2)
-                    self._kept = (named, refined, 0.0)
-                else:
-                    self._shadow = None
+                    self._kept[len(self.proposals) - 1] = named, refined, 0.0
+                    return
+                self._shadow = None
             else:
                 self._note(accepted=None, reason="")
-        elif self._kept is not None:
-            named, change, evidence = self._kept
+        for number, (named, change, evidence) in list(self._kept.items()):
             loss = change * float(block.b[named]) + change**2 * float(block.a[named]) / 2
             evidence -= loss / float(verdict.ratio[named])
-            self._kept = (named, change, evidence)
+            self._kept[number] = named, change, evidence
             if evidence > level:
-                self.proposals[-1] = self.proposals[-1].model_copy(
-                    update={"rolled_back": True, "reason": "predicts later motion worse after all"}
-                )
+                update = {"rolled_back": True, "reason": "predicts later motion worse after all"}
+                self.proposals[number] = self.proposals[number].model_copy(update=update)
                 self._adopt(named, -change, 0.0)
-                self._kept = None
+                del self._kept[number]
+                return
 
     def _note(self, *, accepted: bool | None, reason: str) -> None:
         """Write down how the proposal in shadow does."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from itertools import pairwise
 from typing import Final
@@ -18,7 +19,7 @@ from omnibench.live.stretches import Stretch
 from omnibench.progress import Progress, Reporter, no_progress
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import ReferenceEffect
-from omnibench.robot.kinematics import Array
+from omnibench.robot.kinematics import Array, usable_covariances
 from omnibench.words import plural
 
 _REFITTED: Final = 0.5  # share of a change by which its refitted value may differ; chosen
@@ -63,8 +64,9 @@ def watch_recording(
     # Refit what was accepted, Eq. (6) of Palacin et al. 2023 over the runs since the change.
     changes = guard.accepted
     for name in changes:
-        began = next(alarm.since for alarm in guard.alarms if alarm.name == name)
-        since = ordered[[run.id for run in ordered].index(began) :]
+        number = max(k for k, each in enumerate(guard.proposals) if each.name == name and each.accepted)
+        proposal = guard.proposals[number]
+        since = ordered[[run.id for run in ordered].index(proposal.since) :]
 
         def cost(value: float, name: str = name, since: list[Trajectory] = since) -> float:
             changed = guard.proposed(changes | {name: value})
@@ -73,7 +75,10 @@ def watch_recording(
 
         reach = _REFITTED * abs(changes[name])
         bounds = changes[name] - reach, changes[name] + reach
-        changes[name] = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
+        refitted = float(minimize_scalar(cost, bounds=bounds, method="bounded").x)
+        value = proposal.value + refitted - changes[name]
+        guard.proposals[number] = proposal.model_copy(update={"value": value, "low": None, "high": None})
+        changes[name] = refitted
     report = GuardReport(
         alarms=tuple(guard.alarms),
         proposals=tuple(guard.proposals),
@@ -109,6 +114,8 @@ def _watch_run(guard: Guard, run: Trajectory) -> None:
     for k in range(1, len(stamps)):
         if stamps[k] - stamps[chosen[-1]] >= LEAST_POSES and stamps[k] <= run.times[-1]:
             chosen.append(k)
+    if covariances is not None and not usable_covariances(covariances[chosen]).all():
+        covariances = None
     guard.begin(poses[0], None if covariances is None else covariances[0])
     for previous, k in pairwise(chosen):
         since, until = float(stamps[previous]), float(stamps[k])
@@ -128,7 +135,10 @@ def _between(
 
 
 _MOST_SAMPLES: Final = 100_000  # that wait for a pose: 1000 s at 100 Hz; chosen
+_AHEAD: Final = 2.0  # s: a pose that is farther ahead of the wheel samples has no meaning; chosen
+_ROUNDING: Final = 1e-6  # s
 _MOST_TOLD: Final = 5  # alarms and proposals in a health; chosen
+_MOST_ALARMS: Final = 1000  # that are remembered; chosen
 _MOST_POSES: Final = 1000  # that wait to be judged; chosen
 _SECOND: Final = 1e9  # ns
 
@@ -145,6 +155,8 @@ class LiveGuard:
         self._poses: deque[tuple[int, Array, Array]] = deque(maxlen=_MOST_POSES)
         self._last: int | None = None  # stamp of the last pose that was judged, ns; None: the next one begins a run
         self._restart = False
+        self._noted: int | None = None  # stamp of the last pose that was noted, ns
+        self._told_until = 0.0  # s, when the last alarm was told
         self._driven_with: dict[str, float] = {}
 
     def add(self, stamp: int, duration: float, moved: Array, driven: Array) -> None:
@@ -154,13 +166,18 @@ class LiveGuard:
 
     def pose(self, stamp: int, pose: Array, covariance: Array) -> None:
         """Note a reference pose (3,) of the tracked point, with its covariance (3, 3)."""
+        if self._noted is not None and 0 <= stamp - self._noted < LEAST_POSES * _SECOND:
+            return
+        if self._samples and stamp - self._samples[-1][0] > _AHEAD * _SECOND:
+            return
+        self._noted = stamp
         self._poses.append((stamp, pose, covariance))
 
     def restart(self) -> None:
         """Begin again at the next pose: motion or times before it are not known."""
         self._samples.clear()
         self._poses.clear()
-        self._restart = True
+        self._restart, self._noted = True, None
 
     def take(self) -> tuple[list[tuple[int, float, Array, Array]], list[tuple[int, Array, Array]], bool]:
         """The samples and the poses that can be judged now, which are forgotten, and whether a run begins."""
@@ -176,8 +193,8 @@ class LiveGuard:
 
     def judge(
         self, samples: list[tuple[int, float, Array, Array]], poses: list[tuple[int, Array, Array]], restarted: bool
-    ) -> list[Alarm]:
-        """Judge what ``take`` gave; the alarms that are new."""
+    ) -> list[str]:
+        """Judge what ``take`` gave; what is new, in words: alarms, and proposals that were decided."""
         if restarted:
             self._last = None
         if not poses:
@@ -186,19 +203,23 @@ class LiveGuard:
         ends = np.array([(stamp - origin) / _SECOND for stamp, *_ in samples])
         durations = np.array([duration for _, duration, _, _ in samples])
         moved, driven = (np.array([sample[k] for sample in samples]) for k in (2, 3))
-        known = len(self.guard.alarms)
+        guard = self.guard
+        names, before = {alarm.name for alarm in guard.alarms}, tuple(guard.proposals)
         for stamp, pose, covariance in poses:
-            if self._last is not None and (stamp - self._last) / _SECOND < LEAST_POSES:
-                continue
-            since = None if self._last is None else (self._last - origin) / _SECOND
-            if since is None or since < ends[0] - durations[0] - LEAST_POSES:
+            since = -math.inf if self._last is None else (self._last - origin) / _SECOND
+            until = (stamp - origin) / _SECOND
+            if not ends[0] - durations[0] - _ROUNDING <= since < until:  # samples are missing, or it is an old pose
                 self.guard.begin(pose, covariance)
             else:
-                until = (stamp - origin) / _SECOND
                 stretch = _between(self.guard, ends, durations, moved, driven, since, until)
                 self.guard.take(stretch, pose, (self.robot, stamp / _SECOND), covariance)
             self._last = stamp
-        return self.guard.alarms[known:]
+        new = [alarm for alarm in guard.alarms if alarm.name not in names or alarm.t > self._told_until]
+        self._told_until = max((alarm.t for alarm in guard.alarms), default=self._told_until)
+        decided = [each for each in guard.proposals if each.accepted is not None and each not in before]
+        if len(guard.alarms) > _MOST_ALARMS and guard.settled:
+            del guard.alarms[: -_MOST_ALARMS // 2]
+        return [f"{alarm.kind} {alarm.sentence}" for alarm in new] + [each.sentence for each in decided]
 
     def changes_to_drive_with(self) -> dict[str, float] | None:
         """The accepted changes, if the robot does not drive with them yet; else None."""
@@ -213,8 +234,11 @@ class LiveGuard:
     def health(self) -> GuardHealth:
         """What it says now."""
         guard, alarms, proposals = self.guard, tuple(self.guard.alarms), tuple(self.guard.proposals)
-        lasting = [alarm for alarm in alarms if alarm.kind in ("change", "fault")]
+        cured = {*self._driven_with, *(each.name for each in proposals if each.rolled_back)}
+        lasting = [alarm for alarm in alarms if alarm.kind in ("change", "fault") and alarm.name not in cured]
         message = f"nothing changed in {guard.metres:.0f} m"
+        if self._driven_with:
+            message = f"drives with other {', '.join(self._driven_with)} than calibrated; {message} but that"
         if lasting:
             message = lasting[-1].sentence
             if guard.accepted:

@@ -82,7 +82,10 @@ class HeldOut(Model):
 
 
 class Proposal(Model):
-    """A parameter with a new value, in shadow beside the calibration's. accepted: None while it is not decided."""
+    """A parameter with a new value, in shadow beside the calibration's. accepted: None while it is not decided.
+
+    since: the run in which the change began.
+    """
 
     name: str
     value: float
@@ -91,7 +94,14 @@ class Proposal(Model):
     accepted: bool | None = None
     rolled_back: bool = False
     reason: str = ""
+    since: str = ""
     held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
+
+    @property
+    def sentence(self) -> str:
+        """How the proposal stands, in words."""
+        verdict = {True: "accepted", False: "rejected", None: "in shadow"}[self.accepted]
+        return f"{self.name} of {self.value:.6g} is {'rolled back' if self.rolled_back else verdict}: {self.reason}"
 
 
 class GuardHealth(Model):

@@ -194,8 +194,8 @@ class RobotService:
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostics and log what has changed; called once a second."""
-        for alarm in self.tracker.watch():
-            LOG.warning("%s: guard: %s %s", self.tracker.name, alarm.kind, alarm.sentence)
+        for news in self.tracker.watch():
+            LOG.warning("%s: guard: %s", self.tracker.name, news)
         health = self.tracker.health(time.monotonic())
         statuses = diagnostics(health, hardware=self.tracker.calibration.robot.name)
         self._diagnostics.put(Diagnostics(time.time_ns(), statuses))

@@ -7,23 +7,22 @@ runs were turned: a random walk over the way of each contact, with half as much 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from omnibench.errors import DataError
 from omnibench.live.health import Kind
 from omnibench.live.odometry import UNKNOWN_NOISE
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, CarDrive
 from omnibench.robot.odometry import chord_shares
-from omnibench.robot.physical import directions_of, unit_of
+from omnibench.robot.physical import directions_of, read_matrix, unit_of
 
-_UNSTATED: Final = 0.002  # of each row's largest element: what a calibration without a covariance does not know; chosen
+_UNSTATED: Final = 0.01  # of each row's largest element: what a calibration without a covariance does not know; chosen
 _LARGEST_SHARE: Final = 0.5  # of a parameter, or rad, that a change is believed to be; chosen
 _LEAST_SLIP: Final = 1e-4  # rad and m per root metre: nothing rolls more exactly; chosen
+_ONE: Final = 1 - 1e-9  # cosine of two directions that are one but for rounding
 _NO_ANGLE: Final = 1e-9  # rad or m in a stretch: an encoder that stands still
 LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip; chosen
 
@@ -52,14 +51,20 @@ class Hypotheses:
         count = size + 1
         rows: list[tuple[str, Kind, str, float, Array]] = []
         changes = directions_of(robot)
-        try:
-            known: Mapping[str, float] = {n: each.value for n, each in calibration.physical_parameters.items()}
-        except DataError:  # no wheels have this matrix
-            known = {}
-        for name, (design, change) in changes.items():
-            rows.append((name, "change", unit_of(name), known.get(name, design), change))
+        covariance = None if calibration.covariance is None else np.array(calibration.covariance)
+        reading = read_matrix(robot, matrix, covariance, effects=calibration.effects)
+        known = {each.name: each.value for each in reading.parameters}  # none, where no wheels have this matrix
         floor = np.sum([design * change for n, (design, change) in changes.items() if n.startswith("radius")], axis=0)
-        rows.append(("floor", "change", "1", 1.0, floor))
+        alike: list[
+            Array
+        ] = []  # directions of unit length: of two that are one, such as a car's radii, the first stays
+        for name, (design, change) in changes.items():
+            direction = change / np.linalg.norm(change)
+            if not any(abs(float(direction @ other)) > _ONE for other in alike):
+                alike.append(direction)
+                rows.append((name, "change", unit_of(name), known.get(name, design), change))
+        if not any(abs(float(floor @ other)) > _ONE * np.linalg.norm(floor) for other in alike):
+            rows.append(("floor", "change", "1", 1.0, floor))
         scale = (matrix * np.array([[1.0], [1.0], [0.0]])).ravel()
         rows.append(("reference_scale", "reference", "1", 1.0, scale))
         directions = np.zeros((count, len(rows) + 1))

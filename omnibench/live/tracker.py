@@ -36,7 +36,7 @@ from omnibench.live.fusion import (
     predict,
 )
 from omnibench.live.guarding import LiveGuard
-from omnibench.live.health import Alarm, Counts, FusionHealth, Health, Status, SwapRecord
+from omnibench.live.health import Counts, FusionHealth, Health, Status, SwapRecord
 from omnibench.live.odometry import ExtrapolationMonitor, LiveOdometry, Motion
 from omnibench.live.state import RobotMemory, SavedState
 from omnibench.live.topics import Frames, JointStateDecoder, Update
@@ -244,21 +244,24 @@ class RobotTracker:
                 self._guard.pose(measurement.stamp, measurement.pose, measurement.covariance)
             return self._fusion.correct(measurement)
 
-    def watch(self) -> list[Alarm]:
+    def watch(self) -> list[str]:
         """Let the guard judge what came since the last call, and drive with what it accepts if that is asked for.
 
-        The alarms that are new. It may take long, and nothing waits for it. For one thread.
+        What is new, in words. It may take long, and nothing waits for it. For one thread.
         """
         guard = self._guard
         if guard is None:
             return []
         with self._state_lock:
             work = guard.take()
-        alarms = guard.judge(*work)
+        news = guard.judge(*work)
         if self._guarding == "swap" and (changes := guard.changes_to_drive_with()) is not None:
-            self.swap(guard.guard.proposed(changes) or guard.guard.calibration, guard)
-            guard.drives_with(changes)
-        return alarms
+            guard.drives_with(changes)  # whether it can be swapped in or not
+            try:
+                self.swap(guard.guard.proposed(changes) or guard.guard.calibration, guard)
+            except DataError as error:
+                news.append(f"cannot drive with that: {error}")
+        return news
 
     @property
     def fusing(self) -> bool:
@@ -360,6 +363,8 @@ class RobotTracker:
         """
         try:
             with self._state_lock:
+                if guard is not None and guard is not self._guard:
+                    return  # an operator's calibration came meanwhile
                 _check_same_robot(calibration, self.calibration)
                 odometry = self._odometry.continued(calibration)
                 self._reference = ReferenceCorrection(calibration.model, self._reference.start)

@@ -26,13 +26,14 @@ from omnibench.report.blocks import (
 from omnibench.report.figures import line
 from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import PALETTE, plot
-from omnibench.words import kind_of_data, plural
+from omnibench.words import kind_of_data
 
 _SHOWN = 6  # hypotheses that the picture shows; chosen
 
 
 class GuardResult(Result):
-    """What a guard told, of the calibration in ``file`` on data sets as they were typed. proposed: the file written."""
+    """What a guard told, of the calibration in ``file`` on data sets as they were typed. proposed: the file written;
+    asked: the one that was to be."""
 
     title = "guard"
 
@@ -45,9 +46,10 @@ class GuardResult(Result):
         file: Path,
         sources: Sequence[Path] = (),
         proposed: Path | None = None,
+        asked: Path | None = None,
     ) -> None:
         self.report, self.guard, self.dataset, self.simulated = report, guard, dataset, simulated
-        self.file, self.sources, self.proposed = file, sources, proposed
+        self.file, self.sources, self.proposed, self.asked = file, sources, proposed, asked
 
     def sentence(self) -> str:
         report = self.report
@@ -55,8 +57,11 @@ class GuardResult(Result):
         changes = [alarm for alarm in report.alarms if alarm.kind in ("change", "fault")]
         if changes:
             return f"In {driven}: {'; '.join(alarm.sentence for alarm in changes)}."
-        others = f"; {plural(len(report.alarms), 'passing event')}" if report.alarms else ""
+        others = f"; besides, {', '.join(alarm.sentence for alarm in report.alarms)}" if report.alarms else ""
         return f"Nothing changed in {driven}, as far as {self.file.name} states its noise{others}."
+
+    def opening(self) -> Sequence[Remark]:
+        return [Remark(self.sentence())]
 
     def tables(self) -> Sequence[Table]:
         tables = []
@@ -85,6 +90,8 @@ class GuardResult(Result):
 
     def remarks(self) -> Sequence[Remark]:
         lines = [Remark(f"{alarm.name}: {alarm.advice}", "warning") for alarm in self.report.alarms if alarm.advice]
+        if self.asked is not None and self.proposed is None:
+            lines.append(Remark(f"no change was accepted: {self.asked} is not written", "warning"))
         if self.proposed is not None:
             lines.append(Remark(f"{self.proposed} holds the accepted values", "good"))
         return lines
