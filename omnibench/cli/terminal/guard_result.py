@@ -28,6 +28,7 @@ from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import PALETTE, plot
 from omnibench.words import kind_of_data
 
+_WORDS = ("name", "value", "interval", "told in")  # columns of the alarms
 _SHOWN = 6  # hypotheses that the picture shows; chosen
 
 
@@ -73,7 +74,7 @@ class GuardResult(Result):
                 value = "" if alarm.value is None else number_with_unit(alarm.value, alarm.unit)
                 cells = (alarm.kind, alarm.name, value, interval, told, f"{alarm.detected_after_m:.1f}")
                 rows.append(Row.of(*cells, ", ".join(alarm.alternatives)))
-            words = (Column(title, numeric=False) for title in ("name", "value", "interval", "told in"))
+            words = [Column(title, numeric=False, priority=title == "interval") for title in _WORDS]
             head = columns("kind", *words, "after (m)", Column("or", numeric=False))
             tables.append(Table("alarms", head, tuple(rows)))
         if self.report.proposals:
