@@ -194,9 +194,7 @@ class Guard:
         self._freedom: Array = np.full(len(self.hypotheses.names), float(told))
         self._alarm: int | None = None  # hypothesis of the alarm that is open
         self._shadow: tuple[int, float, float, float] | None = None  # hypothesis, change, variance, log of e
-        self._kept: dict[
-            int, tuple[int, float, float]
-        ] = {}  # accepted: hypothesis, change, log of e
+        self._kept: dict[int, tuple[int, float, float]] = {}  # accepted: hypothesis, change, log of e
         self._ratio = 1.0
         self._last_step, self._quiet = -math.inf, 0
         self._last_changed, self._changed_at = np.zeros(3), -math.inf
