@@ -187,7 +187,7 @@ class Guard:
         self._squares: list[float] = []
         self._slow_squares: deque[float] = deque(maxlen=_SQUARES)
         self._stretches, self._slow = 0, 1.0
-        self._sum, self._sum_before = np.zeros(3), np.zeros(3)
+        self._sum: Array = np.zeros(3)
         self._scale, self._tail, self._fastest = 1.0, 4.0, 0.0  # until it is known
         self._usual_ratio: Array = np.ones(len(self.hypotheses.names))
         told = _STATED if calibration.slip is None else min(max(calibration.slip.runs, _LEAST_STATED), _LONGEST_MEMORY)
@@ -286,9 +286,9 @@ class Guard:
         self._white, self._sum = white, self._sum + white
         self._stretches += 1
         if self._stretches % _RECENT == 0:  # sums of several are larger where the reference drifts
-            self._slow_squares.append(float(np.square(self._sum - self._sum_before).sum()) / (2 * _RECENT))
+            self._slow_squares.append(float(np.square(self._sum).sum()) / _RECENT)
             self._slow = max(1.0, float(np.median(self._slow_squares)) / _MEDIAN)
-            self._sum, self._sum_before = np.zeros(3), self._sum
+            self._sum = np.zeros(3)
         if len(self._squares) % _SQUARES == 0:  # a reference that scatters more than it says counts for less
             self._scale = max(1.0, self._scale * float(np.median(self._squares[-_SQUARES:])) / _MEDIAN)
             self._squares = self._squares[-_REMEMBERED:]
