@@ -77,6 +77,7 @@ _STRONG: Final = 0.04  # share of a radius: no tyre changes by more, but a wheel
 LEAST_POSES: Final = 0.2  # s between two poses that are compared; chosen
 _CLIP: Final = 4.0  # of the norm of an innovation by its deviation: more counts as so much (Huber); chosen
 _SQUARES: Final = 32  # innovations of which the median is taken; chosen
+_DRIFTING: Final = 4.0  # times its variance, by which a reference may drift within 2 s; chosen
 _REMEMBERED: Final = 256  # innovations whose tail is compared with that of normal ones; chosen
 _RARE: Final = 9.837  # 0.98 quantile of chi-square with 3 degrees of freedom
 _MEDIAN: Final = 2.366  # of chi-square with 3 degrees of freedom
@@ -573,8 +574,8 @@ class Guard:
                 squares, free = before[0][left] + after[0][right], before[1][left] + after[1][right]
                 ratio = (stated * self._usual_ratio + squares) / (stated + free)
                 ratios[first] = np.maximum(ratios[first], ratio)
-        # A reference that drifts errs at the ends of a window, however long that is.
-        ratios *= 1 + (self._slow - 1) / numbers[::-1].cumsum()[::-1, None]
+        # A reference that drifts errs at the ends of a window, however long that is; what is more is a change.
+        ratios *= 1 + (min(self._slow, _DRIFTING) - 1) / numbers[::-1].cumsum()[::-1, None]
         # What the blocks before tell of what the calibration does not know, and what is left of it.
         wholes = np.cumsum([0 * self._untold, *(block.whole for block in self._blocks)], axis=0)
         scores = np.cumsum([0 * self._untold[0], *(block.score for block in self._blocks)], axis=0)
