@@ -204,7 +204,7 @@ def account_replays(
     counted = difference(now, before)
     for life, part in enumerate(parts):
         index = np.searchsorted(stamps, part.stamps)
-        known = (index < len(stamps)) & (stamps[np.minimum(index, len(stamps) - 1)] == part.stamps)
+        known = np.isin(part.stamps, stamps)
         if life:
             unknown = int(np.count_nonzero(~known & (part.numbers > 0)))
             account.problem(unknown, "stamps of odom that no replay has sent")
