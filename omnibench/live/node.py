@@ -268,6 +268,8 @@ class RobotService:
 
     def _take_waiting(self) -> None:
         """Take the messages that wait, at most a batch; by who holds ``_working``."""
+        if self.tracker.closed:  # what is still on its way must not be acknowledged: the state is written
+            return
         self._scheduled = False  # before the first look: what comes from now on may schedule a turn in vain
         behind = 0.0
         for _ in range(min(len(self._waiting), _BATCH)):

@@ -107,7 +107,7 @@ class RobotTracker:
 
     calibration: the one that runs. counts: everything that was taken, refused or put right. refusals: number of
     messages that were refused for a reason. flows: flow of an acknowledged replay -> number of the next message that is
-    not in the odometry.
+    not in the odometry. closed: it takes no more wheel samples.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class RobotTracker:
         self._rate = 0.0  # Hz
         self._stale_after = stale_after
         self._state_lock = threading.Lock()  # held while the state is read or changed
-        self._closed = False
+        self.closed = False
         self.waiting_since: Callable[[], float | None] = lambda: None  # when the oldest that waits came, s, monotonic
 
     def take_wheels(self, payload: bytes, arrival: float, skipped: int = 0, *, replayed: bool = False) -> list[Update]:
@@ -166,7 +166,7 @@ class RobotTracker:
         messages before it that never came, by the sender's numbers. replayed: its stamp counts in any case.
         """
         with self._state_lock:
-            if self._closed:
+            if self.closed:
                 return []
             wheels, odometry, fusion, timeline = self._wheels, self._odometry, self._fusion, self._timeline
             # 1. Decode the message; what cannot be of this robot's wheels is refused.
@@ -444,7 +444,7 @@ class RobotTracker:
     def close(self) -> None:
         """Take no more wheel samples, and write the state."""
         with self._state_lock:
-            self._closed = True
+            self.closed = True
             self._save()
             if self._memory is not None:
                 self._memory.close()
@@ -453,13 +453,13 @@ class RobotTracker:
     def _save(self) -> None:
         """Write the state after the last wheel sample; a disk that refuses is counted and told in health."""
         last, fusion = self._wheels.last, self._fusion
-        if self._memory is None or last is None or self._arrival is None:
+        if self._memory is None or last is None:
             return
-        self._save_due = self._arrival + _SAVE_PERIOD
+        self._save_due = last.arrival + _SAVE_PERIOD
         fused = fusion.estimate if fusion is not None and fusion.located else (None, None)
         saved = SavedState.model_construct(  # not validated: reading refuses numbers that cannot be
             stamp=last.stamp,
-            wall=time.time() - (time.monotonic() - self._arrival),
+            wall=time.time() - (time.monotonic() - last.arrival),
             positions=_row(self._wheels.known),
             steering=_row(last.steering),
             pose=_row(self._odometry.pose),

@@ -320,6 +320,28 @@ def test_a_robot_goes_on_where_it_was_after_its_node_was_killed(tmp_path: Path) 
     memory.close()
 
 
+def test_a_node_that_was_killed_before_its_first_wheel_sample_leaves_what_it_had_acknowledged(tmp_path: Path) -> None:
+    path = drive(1.0)
+    memory = RobotMemory(tmp_path, "apr")
+    robot = tracker(memory=memory)
+    fed(robot, path.payloads()[:50])
+    robot.close()
+
+    memory = RobotMemory(tmp_path, "apr")
+    again, saved = tracker(memory=memory), memory.load()
+    again.resume(saved, now=5.0, wall=saved.wall + 3.0)
+    again.flows[7] = 12  # poses of SLAM alone, by a replay
+    again.save()
+    memory.close()
+
+    memory = RobotMemory(tmp_path, "apr")
+    left = memory.load()
+    memory.close()
+    assert left.flows == {7: 12}
+    assert (left.stamp, left.pose) == (saved.stamp, saved.pose)
+    assert left.wall == pytest.approx(saved.wall, abs=60.0)
+
+
 def test_two_nodes_cannot_share_a_robots_memory(tmp_path: Path) -> None:
     with closing(RobotMemory(tmp_path, "apr")), pytest.raises(ConfigError, match=r"apr\.state\.json: another node"):
         RobotMemory(tmp_path, "apr")

@@ -150,7 +150,7 @@ class Ledger:
         if before is not None and all(confirmed for _, _, confirmed in replays):
             taken = sum(flow.taken for flow in flows)
             account.problem(taken - handled, "messages acknowledged, but neither taken nor refused")
-        for stamps, _, _ in replays:
+        for stamps, _, confirmed in replays:
             previous = None
             for part in parts:
                 inside = (part.stamps >= stamps[0]) & (part.stamps <= stamps[-1])
@@ -160,7 +160,8 @@ class Ledger:
                 index = np.searchsorted(stamps, chosen.stamps)
                 if len(index) > 1:
                     check_path(account, chosen, index, [system.played_path], 0)
-                if previous is not None and not system.disk_was_full:
+                # what nobody acknowledges is lost with its node, and the odometry of the next one lacks it
+                if confirmed and previous is not None and not system.disk_was_full:
                     check_going_on(account, *previous, chosen.poses[:1], index[:1], system.played_path)
                 previous = chosen.poses[-1:], index[-1:]
         return account
