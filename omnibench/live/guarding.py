@@ -26,7 +26,7 @@ _REFITTED: Final = 0.5  # share of a change by which its refitted value may diff
 
 
 class GuardReport(Model):
-    """What a guard told of a recording. metres, seconds: driven between poses, standing included.
+    """The guard's answer on a recording. metres, seconds: watched between poses, standing included.
 
     proposed: the calibration with the changes that were accepted, each refitted to the final poses of the runs since.
     """
@@ -232,7 +232,7 @@ class LiveGuard:
         self.guard.drives_with(changes)
 
     def health(self) -> GuardHealth:
-        """What it says now."""
+        """Its part of the robot's health."""
         guard, alarms, proposals = self.guard, tuple(self.guard.alarms), tuple(self.guard.proposals)
         cured = {*self._driven_with, *(each.name for each in proposals if each.rolled_back)}
         lasting = [alarm for alarm in alarms if alarm.kind in ("change", "fault") and alarm.name not in cured]

@@ -35,10 +35,10 @@ Kind = Literal["change", "fault", "burst", "reference"]
 
 
 class Alarm(Model):
-    """What the guard tells: of a change or a fault its name, value and 95 % interval; of the others their size.
+    """A statement of the guard: of a change or a fault its name, value and 95 % interval; of the others their size.
 
-    kind: change of the robot, fault of a wheel or its encoder, burst that is over, or the reference's. value, low,
-    high: in ``unit``. trajectory, t: when it was told, and ``since_t`` when it began, s of the run ``since``.
+    kind: a change of the robot, a fault of a wheel or its encoder, a burst that is over, or of the reference. value,
+    low, high: in ``unit``. trajectory, t: when it was raised, s of that run; since, since_t: when its cause began.
     detected_after_m: m that the wheels rolled between the two. alternatives: names that explain it nearly as well, of
     which ``advice`` says how to tell them apart.
     """
@@ -98,16 +98,21 @@ class Proposal(Model):
     held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
 
     @property
+    def verdict(self) -> str:
+        """Where the proposal stands, in one or two words."""
+        verdicts = {True: "accepted", False: "rejected", None: "in shadow"}
+        return "rolled back" if self.rolled_back else verdicts[self.accepted]
+
+    @property
     def sentence(self) -> str:
-        """How the proposal stands, in words."""
-        verdict = {True: "accepted", False: "rejected", None: "in shadow"}[self.accepted]
-        return f"{self.name} of {self.value:.6g} is {'rolled back' if self.rolled_back else verdict}: {self.reason}"
+        """Where the proposal stands, and why."""
+        return f"{self.name} of {self.value:.6g} is {self.verdict}: {self.reason}"
 
 
 class GuardHealth(Model):
-    """What a robot's guard says. changed: it has told a change or a fault; message: the last of them. metres: watched.
+    """The guard's part of a robot's health. changed: there was a change or a fault; message: the last of them.
 
-    alarms, proposals: the latest.
+    metres: watched so far. alarms, proposals: the latest.
     """
 
     changed: bool

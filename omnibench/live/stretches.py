@@ -1,4 +1,4 @@
-"""What a guard compares: the hypotheses on what changed, and the motion between two reference poses as predicted.
+"""Hypotheses on what changed, and stretches: the motion between two reference poses as a calibration predicts it.
 
 Contacts of wheels with the ground slip independently of each other, so much that they turn the robot as its training
 runs were turned: a random walk over the way of each contact, with half as much of the place beside it.

@@ -1,4 +1,4 @@
-"""What a guard told of a recording, as it is shown: alarms, proposals, and the estimates over the way."""
+"""The answer of ``omnibench guard``: alarms, proposals, and the evidence for each change over the way."""
 
 from __future__ import annotations
 
@@ -28,13 +28,15 @@ from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import PALETTE, plot
 from omnibench.words import kind_of_data
 
-_WORDS = ("name", "value", "interval", "told in")  # columns of the alarms
-_SHOWN = 6  # hypotheses that the picture shows; chosen
+_CURVES = 6  # hypotheses that the picture shows; chosen
 
 
 class GuardResult(Result):
-    """What a guard told, of the calibration in ``file`` on data sets as they were typed. proposed: the file written;
-    asked: the one that was to be."""
+    """A guard's answer on a recording.
+
+    file: of the calibration. sources: data sets, as they were typed. asked: where the proposed calibration was to be
+    written; proposed: where it was.
+    """
 
     title = "guard"
 
@@ -70,21 +72,19 @@ class GuardResult(Result):
             rows: list[Row] = []
             for alarm in self.report.alarms:
                 interval = "" if alarm.low is None or alarm.high is None else f"{alarm.low:.5g} to {alarm.high:.5g}"
-                told = f"{alarm.trajectory} {alarm.t:.1f} s"
                 value = "" if alarm.value is None else number_with_unit(alarm.value, alarm.unit)
-                cells = (alarm.kind, alarm.name, value, interval, told, f"{alarm.detected_after_m:.1f}")
-                rows.append(Row.of(*cells, ", ".join(alarm.alternatives)))
-            words = [Column(title, numeric=False, priority=title == "interval") for title in _WORDS]
+                cells = alarm.kind, alarm.name, value, interval, f"{alarm.trajectory} {alarm.t:.1f} s"
+                rows.append(Row.of(*cells, f"{alarm.detected_after_m:.1f}", ", ".join(alarm.alternatives)))
+            titles = ("name", "value", "interval", "told in")
+            words = [Column(title, numeric=False, priority=title == "interval") for title in titles]
             head = columns("kind", *words, "after (m)", Column("or", numeric=False))
             tables.append(Table("alarms", head, tuple(rows)))
         if self.report.proposals:
             rows = []
             for each in self.report.proposals:
-                verdict = {True: "accepted", False: "rejected", None: "in shadow"}[each.accepted]
-                verdict = "rolled back" if each.rolled_back else verdict
                 ratio = each.held_out.error_ratio
                 error = "" if ratio is None else f"{ratio - 1:+.0%}"
-                rows.append(Row.of(each.name, f"{each.value:.6g}", verdict, f"{each.held_out.metres:.0f}", error))
+                rows.append(Row.of(each.name, f"{each.value:.6g}", each.verdict, f"{each.held_out.metres:.0f}", error))
             head = columns("proposal", "value", Column("verdict", numeric=False), "judged on (m)", "error there")
             tables.append(Table("proposals", head, tuple(rows)))
         return tables
@@ -123,13 +123,13 @@ class GuardResult(Result):
         return NextStep("the calibration holds", "")
 
     def figures(self) -> Sequence[FigureGrid]:
-        """Estimates of what may have changed over the way, in standard deviations of what is told."""
+        """The evidence for the likeliest changes over the way."""
         history, names = self.guard.history, self.guard.hypotheses.names
         if not history:
             return ()
         metres = np.array([point[0] for point in history])
         strengths = [point[1] for point in history]
-        strongest = sorted(range(len(names)), key=lambda j: -max(float(row[j]) for row in strengths))[:_SHOWN]
+        strongest = sorted(range(len(names)), key=lambda j: -max(float(row[j]) for row in strengths))[:_CURVES]
         traces, legend = [], []
         for number, j in enumerate(strongest):
             item = LegendItem(names[j], names[j], PALETTE[number % len(PALETTE)])
