@@ -122,14 +122,16 @@ class _Verdict:
 class _Trial:
     """How a change of one hypothesis does on the blocks that come after it was proposed or, later, accepted.
 
-    number: of the proposal. begun: m driven until then. log_e: log of the likelihood ratio, for it while it is in
-    shadow and against it later. without, within: sums of squared errors without and with the change.
+    number: of the proposal. begun: m driven until then. variance: of the change, once it is accepted. log_e: log of
+    the likelihood ratio, for the change while it is in shadow and against it later. without, within: sums of squared
+    errors without and with it.
     """
 
     number: int
     hypothesis: int
     change: float
     begun: float
+    variance: float = 0.0
     log_e: float = 0.0
     without: float = 0.0
     within: float = 0.0
@@ -403,10 +405,11 @@ class Guard:
 
         a, b (F, P): d' A d and d' b of each block along each hypothesis, of ``numbers`` (F,) blocks each.
         """
-        ratios, firsts = np.full(a.shape, _LEAST_RATIO), np.arange(len(a))
+        ratios = np.full(a.shape, _LEAST_RATIO)
         for scale in _SCALES:
             places = (np.cumsum(numbers) - numbers) // scale
-            edges = np.flatnonzero(np.diff(places, prepend=-1))
+            begins = np.diff(places, prepend=-1) > 0
+            edges = np.flatnonzero(begins)
             ga, gb, sizes = (np.add.reduceat(rows, edges, axis=0) for rows in (a, b, numbers))
             if scale == 1:
                 within = np.array([block.scatter for block in self._blocks])
@@ -415,8 +418,8 @@ class Guard:
             before, free_before = _scatter_within(ga, gb, within, sizes)
             after, free_after = (rows[::-1] for rows in _scatter_within(ga[::-1], gb[::-1], within[::-1], sizes[::-1]))
             # Groups wholly after, and wholly before.
-            right = np.searchsorted(edges, firsts)
-            left = np.where(np.isin(firsts, edges), right, np.maximum(right - 1, 0))
+            right = np.searchsorted(edges, np.arange(len(a)))
+            left = np.where(begins, right, np.maximum(right - 1, 0))
             stated, free = max(self._freedom / scale, _LEAST_STATED), (free_before[left] + free_after[right])[:, None]
             ratio = (stated * self._usual_ratio + before[left] + after[right]) / (stated + free)
             ratios = np.maximum(ratios, ratio)
@@ -520,12 +523,10 @@ class Guard:
             ousted = other != named and verdict.h[other] > verdict.h[named] + _APART
             sure = other == named and float(np.partition(verdict.h, -2)[-2]) < verdict.h[named] - _APART
             accepted: bool | None = None
-            reason, interval = "", {}
+            reason = ""
             if trial.log_e > level and sure:
                 accepted, reason = True, "predicts later motion better"
-                trial.change, deviation = float(verdict.change[named]), float(verdict.deviation[named])
-                value, reach = self._value_of(named, trial.change), 1.96 * deviation
-                interval = {"value": value, "low": value - reach, "high": value + reach}
+                trial.change, trial.variance = float(verdict.change[named]), float(verdict.deviation[named]) ** 2
                 self._retell(self._alarm_of(verdict))
             elif ousted:
                 accepted, reason = False, f"{self.hypotheses.names[other]} explains it better"
@@ -533,14 +534,18 @@ class Guard:
                 accepted, reason = False, "predicts later motion worse"
             ratio = math.sqrt(trial.within / trial.without) if trial.without > 0 else None
             held_out = HeldOut(metres=self.metres - trial.begun, log_e=trial.log_e, error_ratio=ratio)
-            self._note(trial, accepted=accepted, reason=reason, held_out=held_out, **interval)
+            self._note(trial, accepted=accepted, reason=reason, held_out=held_out)
             if accepted:
-                self._adopt(named, trial.change, deviation**2)
+                self._adopt(named, trial.change, trial.variance)
+                self._note_value(trial)
                 trial.log_e = 0.0
-                self._accepted.append(trial)
+                self._accepted = [*(each for each in self._accepted if each.hypothesis != named), trial]
                 return
             if accepted is False:
                 self._shadow = None
+                if verdict.h[other] <= THRESHOLD:  # it has passed
+                    del self._blocks[verdict.first :]
+                    self._alarm = None
         for trial in self._accepted:
             named, change = trial.hypothesis, trial.change
             trial.log_e -= float(change * b[named] + change**2 * a[named] / 2) / float(verdict.ratio[named])
@@ -549,6 +554,27 @@ class Guard:
                 self._adopt(named, -change, 0.0)
                 self._accepted.remove(trial)
                 return
+            if self.settled:
+                self._refine(trial, float(verdict.ratio[named]))
+
+    def _refine(self, trial: _Trial, ratio: float) -> None:
+        """Take an accepted change for what the motion since then says of it, each time that it is twice as sure."""
+        direction = self.hypotheses.directions[:, trial.hypothesis]
+        others = self._untold - trial.variance * direction[:, None] * direction
+        whole, score = (sum(getattr(block, name) for block in self._blocks) / ratio for name in ("whole", "score"))
+        joint = np.linalg.solve(np.eye(len(others)) + whole @ others, np.column_stack([whole, score]))
+        variance = 1 / (1 / trial.variance + float(direction @ joint[:, :-1] @ direction))
+        if 4 * variance > trial.variance:
+            return
+        change = variance * float(direction @ joint[:, -1])
+        self._adopt(trial.hypothesis, change, variance - trial.variance)
+        trial.change, trial.variance = trial.change + change, variance
+        self._note_value(trial)
+
+    def _note_value(self, trial: _Trial) -> None:
+        """Write down the value of an accepted proposal, with its 95 % interval."""
+        value, reach = self._value_of(trial.hypothesis, 0.0), 1.96 * math.sqrt(trial.variance)
+        self._note(trial, value=value, low=value - reach, high=value + reach)
 
     def _note(self, trial: _Trial, **update: object) -> None:
         """Write down how a proposal does."""

@@ -234,7 +234,8 @@ class LiveGuard:
     def health(self) -> GuardHealth:
         """Its part of the robot's health."""
         guard, alarms, proposals = self.guard, tuple(self.guard.alarms), tuple(self.guard.proposals)
-        cured = {*self._driven_with, *(each.name for each in proposals if each.rolled_back)}
+        last = {each.name: each for each in proposals}
+        cured = {*self._driven_with, *(name for name, each in last.items() if each.passed)}
         lasting = [alarm for alarm in alarms if alarm.kind in ("change", "fault") and alarm.name not in cured]
         message = f"nothing changed in {guard.metres:.0f} m"
         if self._driven_with:

@@ -98,6 +98,11 @@ class Proposal(Model):
     held_out: HeldOut = HeldOut(metres=0.0, log_e=0.0, error_ratio=None)
 
     @property
+    def passed(self) -> bool:
+        """True if there is no such change after all, or not any more."""
+        return self.rolled_back or self.accepted is False
+
+    @property
     def verdict(self) -> str:
         """Where the proposal stands, in one or two words."""
         verdicts = {True: "accepted", False: "rejected", None: "in shadow"}

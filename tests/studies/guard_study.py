@@ -145,15 +145,15 @@ class Drive:
     steering: Array | None
 
 
-def driven(truth: Truth, twists: Array, rng: np.random.Generator, then: tuple[int, Truth] | None = None) -> Drive:
-    """A drive by commanded twists (F, 3); from step ``then`` on the robot is another."""
+def driven(truth: Truth, twists: Array, rng: np.random.Generator, *then: tuple[int, Truth]) -> Drive:
+    """A drive by commanded twists (F, 3). then: from each of these steps on the robot is another."""
     design = Truth(truth.kind, DESIGNS[truth.kind])
     rows, radii = design.equations()
     signals = (twists @ rows.T)[:, : len(radii)] / radii
     slips = slipping(signals * radii, rng)
     true = truth.twists(signals, slips)
-    if then is not None:
-        true[then[0] :] = then[1].twists(signals[then[0] :], slips[then[0] :])
+    for start, other in then:
+        true[start:] = other.twists(signals[start:], slips[start:])
     turn = true[:, 2] * STEP
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     middle = heading[:-1] + turn / 2
