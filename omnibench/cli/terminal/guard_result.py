@@ -26,6 +26,7 @@ from omnibench.report.blocks import (
 from omnibench.report.figures import line
 from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import PALETTE, plot
+from omnibench.robot.physical import unit_of
 from omnibench.words import kind_of_data
 
 _CURVES = 6  # hypotheses that the picture shows; chosen
@@ -84,7 +85,8 @@ class GuardResult(Result):
             for each in self.report.proposals:
                 ratio = each.held_out.error_ratio
                 error = "" if ratio is None else f"{ratio - 1:+.0%}"
-                rows.append(Row.of(each.name, f"{each.value:.6g}", each.verdict, f"{each.held_out.metres:.0f}", error))
+                value = number_with_unit(each.value, unit_of(each.name))
+                rows.append(Row.of(each.name, value, each.verdict, f"{each.held_out.metres:.0f}", error))
             head = columns("proposal", "value", Column("verdict", numeric=False), "judged on (m)", "error there")
             tables.append(Table("proposals", head, tuple(rows)))
         return tables
@@ -136,7 +138,7 @@ class GuardResult(Result):
             legend.append(item)
             hover = f"{names[j]}<br>%{{x:.0f}} m: %{{y:.1f}}"
             traces.append(line(item, 1.6, metres, np.array([row[j] for row in strengths]), hover=hover))
-        figure = plot(*traces, x_title="driven (m)", y_title="evidence, h of Eq. (G4)")
+        figure = plot(*traces, x_title="driven (m)", y_title="evidence")
         figure.add_hline(y=THRESHOLD, line_dash="dash", annotation_text="told from here on")
         words = f"Evidence for {', '.join(names[j] for j in strongest)} over {metres[-1]:.0f} m."
         return (FigureGrid((Figure("Evidence for a change", figure, words),), tuple(legend), 1, name="evidence"),)
