@@ -21,6 +21,7 @@ from omnibench.robot.kinematics import Array, pose_covariance, rotation
 
 RECENT: Final = 8  # stretches at which a step is looked for, and which are not yet in a block (chosen, as all here)
 _CLIP: Final = 4.0  # of the norm of an innovation by its deviation: more counts as so much (Huber)
+_VAGUE: Final = 10.0  # times its deviation: the pose with which the filter begins may be an outlier
 _CLEAR: Final = 3.0  # standard deviations of a pose that a step has at least
 _OFFSET: Final = 0.003  # rad, least standard deviation of a reference's heading offset in a run
 _LEAST_DEVIATION: Final = 1e-4  # m, rad: no reference is more exact
@@ -172,7 +173,7 @@ class PoseFilter:
             self.delay.learn(float(self.state[3]))
         self.state = np.array([*pose.tolist(), self.delay.mean, 0.0])
         self.covariance = np.zeros((5, 5))
-        self.covariance[:3, :3] = self._usual if covariance is None else covariance + self._least
+        self.covariance[:3, :3] = _VAGUE**2 * (self._usual if covariance is None else covariance + self._least)
         self.covariance[3, 3], self.covariance[4, 4] = self.delay.variance, self._offset**2
         self._be_turned()
         self.deviation = np.zeros_like(self.deviation)
@@ -254,7 +255,7 @@ class PoseFilter:
         self.state[:3] = self._pose
         self.state[2] -= self.state[4]
         self.covariance[:3, 3:] = self.covariance[3:, :3] = 0.0
-        self.covariance[:3, :3] = self._spread
+        self.covariance[:3, :3] = _VAGUE**2 * self._spread
         self._be_turned()
         self.deviation[:] = 0.0
         self._be_late(self._velocity)

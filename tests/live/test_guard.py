@@ -130,6 +130,15 @@ def test_what_passes_is_told_as_such_and_changes_no_parameter(
     assert guard.proposed() is None
 
 
+def test_a_first_pose_that_is_far_off_is_no_delay_of_the_reference(robot: tuple[Truth, Calibration]) -> None:
+    truth, calibration = robot
+    for seed in range(3):
+        drive = drive_of(truth, 120.0, seed=seed)
+        slam = drive.poses.copy()
+        slam[0, :2] -= [0.15, 0.1]
+        assert told(calibration, drive, slam=slam).alarms == []
+
+
 def test_a_robot_that_stands_moves_no_parameter(robot: tuple[Truth, Calibration]) -> None:
     truth, calibration = robot
     still = drive_of(truth, 300.0)
