@@ -56,12 +56,13 @@ from omnibench.live.stretches import Hypotheses, Predictor, Stretch
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, CarDrive, rotation
 
-_ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal (chosen, as all here)
-_LOOKS: Final = 1e8  # blocks times hypotheses: a robot that drives for ten years
-THRESHOLD: Final = math.log(_LOOKS / _ALPHA)  # of h, Eq. (G4)
-_APART: Final = math.log(100.0)  # of h between a name and its alternatives
-LEAST_POSES: Final = 0.2  # s between two poses that are compared
-_LEAST: Final = 1e-12  # information: less is none
+# All are chosen here and below.
+_ALPHA: Final = 0.05  # probability of any false alarm over all looks, and of any wrong proposal
+_LOOKS: Final = 1e8  # number of looks, blocks times hypotheses: a robot that drives for ten years
+THRESHOLD: Final = math.log(_LOOKS / _ALPHA)  # h, Eq. (G4), beyond which a change is told
+_APART: Final = math.log(100.0)  # hypotheses whose h is nearer to the best one's are alternatives to it
+LEAST_POSES: Final = 0.2  # time between two poses that are compared at least, s
+_LEAST: Final = 1e-12  # least information that a quotient is taken of
 
 
 @dataclass(frozen=True)
@@ -137,27 +138,27 @@ class _Trial:
     within: float = 0.0
 
 
-_METRES: Final = 1.0  # that the wheels roll in a block; chosen, as slip decorrelates within 2 m
-_ALIKE: Final = 6  # blocks of a length, beyond which the oldest two become one (chosen, as all here)
+_METRES: Final = 1.0  # length of a block, m rolled: slip decorrelates within 2 m
+_ALIKE: Final = 6  # number of blocks of one length, beyond which the oldest two become one
 _STATED: Final = 12.0  # n0 of Eq. (G4) where the calibration does not say of how many runs it speaks
-_LEAST_STATED: Final = 3.0  # n0, of few runs or of long-lasting slip
-_LONGEST_MEMORY: Final = 60.0  # degrees of freedom of Birge's ratio that outlive a change
-_LONGEST_HISTORY: Final = 5000  # blocks
+_LEAST_STATED: Final = 3.0  # least n0, for few runs and for slip that lasts
+_LONGEST_MEMORY: Final = 60.0  # degrees of freedom at most by which Birge's ratio outlives a change
+_LONGEST_HISTORY: Final = 5000  # number of blocks that a report shows at most
 _WANDERING: Final = 0.25  # share of what the calibration does not know that differs from path to path
-_DRIFTING: Final = 4.0  # times its variance, by which a reference may drift within 2 s
-_LEAST_RATIO: Final = 0.3  # of Birge: calibrations may state too much noise, too
-_SCALES: Final = (1, 4, 16, 64)  # blocks that Birge's ratio joins, as slip may last
+_DRIFTING: Final = 4.0  # largest factor on the variance of a reference that drifts
+_LEAST_RATIO: Final = 0.3  # least ratio of Birge: calibrations may state too much noise, too
+_SCALES: Final = (1, 4, 16, 64)  # lengths, in blocks, over which Birge's ratio is taken, as slip may last
 _STRONG: Final = 0.04  # share of a radius: no tyre changes by more, but a wheel slips or its encoder errs
-_ALIKE_EFFECT: Final = 0.01  # share of what a change does: less tells it from no other
-_TURNING: Final = 1e-6  # rad/s: less is rounding
-_SETTLED: Final = 10.0  # m after which an alarm of what is no parameter of the robot is taken as the new usual
+_ALIKE_EFFECT: Final = 0.01  # two changes are alike that differ by less than this share of what they do
+_TURNING: Final = 1e-6  # least yaw rate of a motion that turns, rad/s
+_SETTLED: Final = 10.0  # way, m, after which an alarm of what is no parameter of the robot is the new usual
 _FIRST_TOLD: Final = ("trajectory", "t", "since", "since_t", "detected_after_m")  # fields that an alarm keeps
 
-_SURE: Final = 3.0  # times the threshold: so large a step is no change, however well that explains it
-_PARTLY: Final = 0.6  # share of what a step explains: a change that explains as much may be it
-_MOSTLY: Final = 0.8  # share of a step that the motion of one wheel explains
-_CAREFUL: Final = 3.0  # times the threshold of a step while a change is settled
-_PERSISTENT: Final = 5  # steps of one wheel that are no burst any more
+_SURE: Final = 3.0  # a step beyond so many thresholds is no change, however well that explains it
+_PARTLY: Final = 0.6  # a change that explains this share of what a step explains may be the cause instead
+_MOSTLY: Final = 0.8  # a step is one wheel's if that wheel's motion explains this share of it
+_CAREFUL: Final = 3.0  # factor on the threshold of a step while an alarm is open
+_PERSISTENT: Final = 5  # number of steps of one wheel in a row beyond which it is no burst any more
 _WRONG_SPEED: Final = 1.0  # m/s, least speed that tells a jump of the reference from a push
 _SAME_BURST: Final = 6.0  # s within which bursts are one
 _PASSING: Final = ("push", "slip", "reference_jump", "encoder_")
@@ -181,17 +182,17 @@ class Guard:
         size, count = self.hypotheses.directions.shape
         self._filter = PoseFilter(calibration, size)
         self._reach = max(self.predictor.reach, 0.1)  # m
-        self._untold = self.hypotheses.untold.copy()
+        self._prior = self.hypotheses.prior.copy()
         self._assumed, self._driven_with = np.zeros(size), np.zeros(size)
         self._adopted: dict[int, float] = {}  # hypothesis -> change
         self._recent: deque[_Recent] = deque()
-        self._block: _Block | None = None  # that is not long enough yet
+        self._block: _Block | None = None  # the one that grows
         self._blocks: list[_Block] = []
         # Birge's ratios before the oldest block, and the degrees of freedom that stand for them.
         runs = _STATED if calibration.slip is None else calibration.slip.runs
         self._usual_ratio: Array = np.ones(count)
         self._freedom = float(min(max(runs, _LEAST_STATED), _LONGEST_MEMORY))
-        self._ratio = 1.0  # of the last verdict, in the middle of the hypotheses
+        self._ratio = 1.0  # median over the hypotheses of Birge's ratio in the last verdict
         self._alarm: int | None = None  # hypothesis of the alarm that is open
         self._open_at, self._told_at = 0, 0.0  # its place, and the way when it was told, m
         self._shadow: _Trial | None = None
@@ -216,7 +217,7 @@ class Guard:
         learnt = self._filter.begun
         self._filter.begin(pose, covariance)
         if learnt:
-            self._untold[-1, -1] = self._filter.delay.variance
+            self._prior[-1, -1] = self._filter.delay.variance
 
     def take(
         self, stretch: Stretch, pose: Array, at: tuple[str, float], covariance: Array | None = None
@@ -233,7 +234,7 @@ class Guard:
         # A step is told, and nothing enters a block until it is sure that it is over.
         if (step := self._filter.step(self._tail, self._reach)) is not None and step.gain > THRESHOLD:
             if not self._filter.moving and self._filter.delay.explains(step.step, self.seconds):
-                self._untold[-1, -1] = self._filter.delay.variance
+                self._prior[-1, -1] = self._filter.delay.variance
                 self._filter.anchor()
                 self._recent.clear()
                 return []
@@ -271,7 +272,7 @@ class Guard:
         size, turned = math.hypot(step.step[0], step.step[1]), abs(float(step.step[2]))
         name, kind = self._name_of_step(step, parts, size)
         # Changes since any of these stretches; a silent encoder is none, however well they explain it.
-        whole, score = np.zeros_like(self._untold), np.zeros(len(self._untold))
+        whole, score = np.zeros_like(self._prior), np.zeros(len(self._prior))
         rival, directions = 0.0, self.hypotheses.directions
         for recent in reversed(self._recent):
             whole, score = whole + recent.innovation.whole, score + recent.innovation.score
@@ -367,7 +368,7 @@ class Guard:
 
     def _verdict(self) -> _Verdict:
         """Eq. (G3) and (G4) for changes since each of the blocks."""
-        directions, untold, identity = self.hypotheses.directions, self._untold, np.eye(len(self._untold))
+        directions, prior, identity = self.hypotheses.directions, self._prior, np.eye(len(self._prior))
         whole, score, numbers = (
             np.array([getattr(block, name) for block in self._blocks]) for name in ("whole", "score", "count")
         )
@@ -381,10 +382,10 @@ class Guard:
         before, before_score = (np.cumsum(rows, axis=0) - rows for rows in (whole, score))
         after, after_score = whole.sum(axis=0) - before, score.sum(axis=0) - before_score
         before, after = (rows / common[:, None, None] for rows in (before, after))
-        known = np.linalg.solve(identity + untold @ before, np.broadcast_to(untold, before.shape))
+        known = np.linalg.solve(identity + prior @ before, np.broadcast_to(prior, before.shape))
         mean = np.einsum("fqr,fr->fq", known, before_score / common[:, None])
         left = after_score / common[:, None] - np.einsum("fqr,fr->fq", after, mean)
-        known = known + _WANDERING * (untold - known)
+        known = known + _WANDERING * (prior - known)
         # What all that leaves of the blocks since, along each hypothesis.
         joint = np.linalg.solve(identity + after @ known, np.concatenate([after, left[:, :, None]], axis=2))
         along = np.maximum(_along(joint[:, :, :-1], directions), _LEAST)
@@ -511,65 +512,67 @@ class Guard:
         return "drive sideways" if abs(motion[1]) > abs(motion[0]) else "drive straight"
 
     def _weigh(self, block: _Block, verdict: _Verdict) -> None:
-        """Judge what is in shadow, and what was accepted, by a new block."""
+        """Judge what was accepted, and the proposal in shadow, by a new block."""
         level = math.log(len(self.proposals) * (len(self.proposals) + 1) / _ALPHA) if self.proposals else 0.0
         a, b = _along(block.whole, self.hypotheses.directions), block.score @ self.hypotheses.directions
-        if (trial := self._shadow) is not None:
-            named, change = trial.hypothesis, trial.change
-            trial.log_e += float(change * b[named] - change**2 * a[named] / 2) / float(verdict.ratio[named])
-            trial.without += float(block.scatter[named])
-            trial.within += float((b[named] - change * a[named]) ** 2 / max(a[named], _LEAST))
-            other = verdict.best
-            ousted = other != named and verdict.h[other] > verdict.h[named] + _APART
-            sure = other == named and float(np.partition(verdict.h, -2)[-2]) < verdict.h[named] - _APART
-            accepted: bool | None = None
-            reason = ""
-            if trial.log_e > level and sure:
-                accepted, reason = True, "predicts later motion better"
-                trial.change, trial.variance = float(verdict.change[named]), float(verdict.deviation[named]) ** 2
-                self._retell(self._alarm_of(verdict))
-            elif ousted:
-                accepted, reason = False, f"{self.hypotheses.names[other]} explains it better"
-            elif trial.log_e < -level:
-                accepted, reason = False, "predicts later motion worse"
-            ratio = math.sqrt(trial.within / trial.without) if trial.without > 0 else None
-            held_out = HeldOut(metres=self.metres - trial.begun, log_e=trial.log_e, error_ratio=ratio)
-            self._note(trial, accepted=accepted, reason=reason, held_out=held_out)
-            if accepted:
-                self._adopt(named, trial.change, trial.variance)
-                self._note_value(trial)
-                trial.log_e = 0.0
-                self._accepted = [*(each for each in self._accepted if each.hypothesis != named), trial]
-                return
-            if accepted is False:
-                self._shadow = None
-                if verdict.h[other] <= THRESHOLD:  # it has passed
-                    del self._blocks[verdict.first :]
-                    self._alarm = None
-        for trial in self._accepted:
-            named, change = trial.hypothesis, trial.change
-            trial.log_e -= float(change * b[named] + change**2 * a[named] / 2) / float(verdict.ratio[named])
-            if trial.log_e > level:
-                self._note(trial, rolled_back=True, reason="predicts later motion worse after all")
+        for accepted in self._accepted:
+            named, change = accepted.hypothesis, accepted.change
+            accepted.log_e -= float(change * b[named] + change**2 * a[named] / 2) / float(verdict.ratio[named])
+            if accepted.log_e > level:
+                self._note(accepted, rolled_back=True, reason="predicts later motion worse after all")
                 self._adopt(named, -change, 0.0)
-                self._accepted.remove(trial)
+                self._accepted.remove(accepted)
                 return
-            if self.settled:
-                self._refine(trial, float(verdict.ratio[named]))
+            if self.settled and self._refined(accepted, float(verdict.ratio[named])):
+                return
+        trial = self._shadow
+        if trial is None:
+            return
+        named, change = trial.hypothesis, trial.change
+        trial.log_e += float(change * b[named] - change**2 * a[named] / 2) / float(verdict.ratio[named])
+        trial.without += float(block.scatter[named])
+        trial.within += float((b[named] - change * a[named]) ** 2 / max(a[named], _LEAST))
+        other = verdict.best
+        ousted = other != named and verdict.h[other] > verdict.h[named] + _APART
+        sure = other == named and float(np.partition(verdict.h, -2)[-2]) < verdict.h[named] - _APART
+        holds: bool | None = None
+        reason = ""
+        if trial.log_e > level and sure:
+            holds, reason = True, "predicts later motion better"
+            trial.change, trial.variance = float(verdict.change[named]), float(verdict.deviation[named]) ** 2
+            self._retell(self._alarm_of(verdict))
+        elif ousted:
+            holds, reason = False, f"{self.hypotheses.names[other]} explains it better"
+        elif trial.log_e < -level:
+            holds, reason = False, "predicts later motion worse"
+        ratio = math.sqrt(trial.within / trial.without) if trial.without > 0 else None
+        held_out = HeldOut(metres=self.metres - trial.begun, log_e=trial.log_e, error_ratio=ratio)
+        self._note(trial, accepted=holds, reason=reason, held_out=held_out)
+        if holds:
+            self._adopt(named, trial.change, trial.variance)
+            self._note_value(trial)
+            trial.log_e = 0.0
+            self._accepted = [*(each for each in self._accepted if each.hypothesis != named), trial]
+        elif holds is False:
+            self._shadow = None
+            if verdict.h[other] <= THRESHOLD:  # it has passed
+                del self._blocks[verdict.first :]
+                self._alarm = None
 
-    def _refine(self, trial: _Trial, ratio: float) -> None:
-        """Take an accepted change for what the motion since then says of it, each time that it is twice as sure."""
+    def _refined(self, trial: _Trial, ratio: float) -> bool:
+        """Take an accepted change for what the motion since then says of it; False until that is twice as sure."""
         direction = self.hypotheses.directions[:, trial.hypothesis]
-        others = self._untold - trial.variance * direction[:, None] * direction
+        others = self._prior - trial.variance * direction[:, None] * direction
         whole, score = (sum(getattr(block, name) for block in self._blocks) / ratio for name in ("whole", "score"))
         joint = np.linalg.solve(np.eye(len(others)) + whole @ others, np.column_stack([whole, score]))
         variance = 1 / (1 / trial.variance + float(direction @ joint[:, :-1] @ direction))
         if 4 * variance > trial.variance:
-            return
+            return False
         change = variance * float(direction @ joint[:, -1])
         self._adopt(trial.hypothesis, change, variance - trial.variance)
         trial.change, trial.variance = trial.change + change, variance
         self._note_value(trial)
+        return True
 
     def _note_value(self, trial: _Trial) -> None:
         """Write down the value of an accepted proposal, with its 95 % interval."""
@@ -587,7 +590,7 @@ class Guard:
         self._adopted[named] = self._adopted.get(named, 0.0) + change
         late = change if self.hypotheses.names[named] == "reference_clock" else 0.0
         self._filter.change(change * direction, late)
-        self._untold = self._untold + variance * direction[:, None] * direction
+        self._prior = self._prior + variance * direction[:, None] * direction
         self._usual_ratio = self._verdict().ratio
         self._freedom = min(self._freedom + sum(block.count for block in self._blocks), _LONGEST_MEMORY)
         self._blocks.clear()

@@ -234,7 +234,7 @@ class LiveGuard:
     def health(self) -> GuardHealth:
         """Its part of the robot's health."""
         guard, alarms, proposals = self.guard, tuple(self.guard.alarms), tuple(self.guard.proposals)
-        last = {each.name: each for each in proposals}
+        last = {each.name: each for each in proposals} if guard.settled else {}
         cured = {*self._driven_with, *(name for name, each in last.items() if each.passed)}
         lasting = [alarm for alarm in alarms if alarm.kind in ("change", "fault") and alarm.name not in cured]
         message = f"nothing changed in {guard.metres:.0f} m"

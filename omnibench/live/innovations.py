@@ -1,4 +1,4 @@
-"""What a reference pose tells of the stretch before it: the filter whose innovations the guard judges.
+"""The filter whose innovations the guard judges: reference poses against the motion that a calibration predicts.
 
 An extended Kalman filter follows the pose of the tracked point (x, y, heading), the delay of the reference's stamps and
 the offset of its heading. Beside its state it carries the derivatives of the state by all that may have changed, Eq.
@@ -19,17 +19,18 @@ from omnibench.live.stretches import LEAST_STEP, Stretch
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.kinematics import Array, pose_covariance, rotation
 
-RECENT: Final = 8  # stretches at which a step is looked for, and which are not yet in a block (chosen, as all here)
-_CLIP: Final = 4.0  # of the norm of an innovation by its deviation: more counts as so much (Huber)
-_VAGUE: Final = 10.0  # times its deviation: the pose with which the filter begins may be an outlier
-_CLEAR: Final = 3.0  # standard deviations of a pose that a step has at least
+# All are chosen, but for the quantiles of chi-square.
+RECENT: Final = 8  # number of the last stretches, at which a step is looked for, and which are in no block yet
+_CLIP: Final = 4.0  # norm of an innovation in standard deviations, beyond which it is clipped (Huber)
+_VAGUE: Final = 10.0  # factor on the deviation of the pose with which the filter begins, which may be an outlier
+_CLEAR: Final = 3.0  # least size of a step in standard deviations of a pose
 _OFFSET: Final = 0.003  # rad, least standard deviation of a reference's heading offset in a run
 _LEAST_DEVIATION: Final = 1e-4  # m, rad: no reference is more exact
 
-_SQUARES: Final = 32  # innovations of which the median is taken
-_REMEMBERED: Final = 256  # innovations whose tail is compared with that of normal ones
+_SQUARES: Final = 32  # number of innovations of which the median is taken
+_REMEMBERED: Final = 256  # number of innovations whose tail is compared with that of normal ones
 _RARE: Final = 9.837  # 0.98 quantile of chi-square with 3 degrees of freedom
-_MEDIAN: Final = 2.366  # of chi-square with 3 degrees of freedom
+_MEDIAN: Final = 2.366  # median of chi-square with 3 degrees of freedom
 
 
 class ReferenceNoise:
@@ -65,13 +66,13 @@ class ReferenceNoise:
             self.tail = max(1.0, float(np.quantile(self._squares, 0.98)) / _RARE)
 
 
-_DELAY: Final = 0.1  # s, standard deviation of the delay of a reference's stamps when a run begins
-_RUNS: Final = 2.0  # runs for which that counts
-_MOST_DELAYS: Final = 5000  # that are remembered
-_LASTING: Final = 0.8  # share of a change of velocity that a delay still shows at after another stretch
-_FASTER: Final = 0.02  # m/s, a change of velocity that a delay shows at
-_ASIDE: Final = 0.3  # share of a step that is not along the velocity before
-_LATEST: Final = 2.0  # s: no reference is later
+_DELAY: Final = 0.1  # standard deviation of the delay of a reference's stamps when a run begins, s
+_RUNS: Final = 2.0  # number of runs for which that counts
+_MOST_DELAYS: Final = 5000  # number of runs whose delay is remembered
+_LASTING: Final = 0.8  # share of a change of velocity at which a delay still shows after another stretch
+_FASTER: Final = 0.02  # least change of velocity at which a delay shows, m/s
+_ASIDE: Final = 0.3  # largest share of a delay's step across the velocity before
+_LATEST: Final = 2.0  # longest delay of a reference, s
 
 
 class Delay:
@@ -117,7 +118,7 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What a pose tells of q: A (q, q) and b (q,) of Eq. (G2), and its weight, below 1 where it is far off."""
+    """The information of one pose on q: A (q, q) and b (q,) of Eq. (G2); weight: below 1 where the pose is far off."""
 
     whole: Array
     score: Array
@@ -161,10 +162,10 @@ class PoseFilter:
         self._velocity: Array = np.zeros(3)  # at the last pose, in the map
         self._pose: Array = np.zeros(3)  # the last one
         self._spread: Array = np.zeros((3, 3))  # its covariance, as it scatters
-        # Derivatives (R, 5, 3) of the state by a step at each of the last R stretches; what innovations tell of each:
-        # information, score, and the score that counts, side by side (R, 3, 5).
+        # Derivatives (R, 5, 3) of the state by a step at each of the last R stretches; and, side by side (R, 3, 5), the
+        # information on each step, its score, and its clipped score.
         self._steps: Array = np.zeros((0, 5, 3))
-        self._told: Array = np.zeros((0, 3, 5))
+        self._step_sums: Array = np.zeros((0, 3, 5))
         self.keep()
 
     def begin(self, pose: Array, covariance: Array | None) -> None:
@@ -203,7 +204,7 @@ class PoseFilter:
         self.deviation = transition @ self.deviation
         self.deviation[:3] += slopes
         self._steps = np.concatenate([transition @ self._steps, np.eye(5, 3)[None]])[-RECENT:]
-        self._told = np.concatenate([self._told, np.zeros((1, 3, 5))])[-RECENT:]
+        self._step_sums = np.concatenate([self._step_sums, np.zeros((1, 3, 5))])[-RECENT:]
         # Compare with the reference.
         self._velocity = turn @ stretch.velocity
         measured = np.zeros((3, 5))
@@ -220,30 +221,30 @@ class PoseFilter:
         weight = min(1.0, _CLIP / math.sqrt(max(square, 1e-12)))
         slope = measured @ self.deviation
         slope[:, -1] -= self._velocity
-        # What it tells of a step at each of the last stretches.
+        # Add to what is known of a step at each of the last stretches.
         by_step = measured @ self._steps
         score = np.swapaxes(by_step, 1, 2) @ (information @ innovation)
-        self._told[:, :, :3] += np.swapaxes(by_step, 1, 2) @ information @ by_step
-        self._told[:, :, 3:] += score[:, :, None] * [1.0, weight]
+        self._step_sums[:, :, :3] += np.swapaxes(by_step, 1, 2) @ information @ by_step
+        self._step_sums[:, :, 3:] += score[:, :, None] * [1.0, weight]
         # Correct.
         gain = weight * self.covariance @ measured.T @ information
         self.state += gain @ innovation
         self.covariance -= gain @ measured @ self.covariance
         self.deviation -= gain @ slope
         self._steps = self._steps - gain @ by_step
-        told = slope.T @ information
-        return Innovation(told @ slope, told @ innovation, weight)
+        by_change = slope.T @ information
+        return Innovation(by_change @ slope, by_change @ innovation, weight)
 
     def step(self, tail: float, reach: float) -> Step | None:
         """The step of the pose that explains the last innovations best; None: it is too small to be told from noise.
 
         tail: factor on the squares of innovations. reach: m that a wheel rolls for a turn by 1 rad.
         """
-        regular = self._told[:, :, :3] + 1e-9 * np.eye(3)
-        steps, clipped = np.moveaxis(np.linalg.solve(regular, self._told[:, :, 3:]), 2, 0)
-        gains = np.einsum("ij,ij->i", self._told[:, :, 4], clipped) / (2 * tail)
+        regular = self._step_sums[:, :, :3] + 1e-9 * np.eye(3)
+        steps, clipped = np.moveaxis(np.linalg.solve(regular, self._step_sums[:, :, 3:]), 2, 0)
+        gains = np.einsum("ij,ij->i", self._step_sums[:, :, 4], clipped) / (2 * tail)
         at = int(gains.argmax())
-        step, score = steps[at], self._told[at, :, 3]
+        step, score = steps[at], self._step_sums[at, :, 3]
         least = max(LEAST_STEP, _CLEAR * math.sqrt((self._spread[0, 0] + self._spread[1, 1]) / 2))
         if max(math.hypot(step[0], step[1]), abs(float(step[2])) * reach) < least:
             return None
@@ -286,4 +287,4 @@ class PoseFilter:
         self.state[:3] += velocity * self.state[3]
 
     def _forget_steps(self) -> None:
-        self._steps, self._told = self._steps[:0], self._told[:0]
+        self._steps, self._step_sums = self._steps[:0], self._step_sums[:0]

@@ -194,8 +194,6 @@ class RobotService:
 
     def publish_diagnostics(self) -> None:
         """Publish the diagnostics and log what has changed; called once a second."""
-        for news in self.tracker.watch():
-            LOG.warning("%s: guard: %s", self.tracker.name, news)
         health = self.tracker.health(time.monotonic())
         statuses = diagnostics(health, hardware=self.tracker.calibration.robot.name)
         self._diagnostics.put(Diagnostics(time.time_ns(), statuses))
@@ -212,6 +210,8 @@ class RobotService:
             self._logged_refusals = self.tracker.refusals
             last = f"; the last: {health.last_refusal}" if refused and health.last_refusal else ""
             LOG.warning("%s: %s%s", health.robot, in_words, last)
+        for news in self.tracker.watch():  # last, since it may take long
+            LOG.warning("%s: guard: %s", self.tracker.name, news)
 
     def close(self) -> None:
         """Take what waits, nothing more, and leave."""

@@ -31,7 +31,7 @@ LEAST_STEP: Final = 0.02  # m and, times the reach, rad: smaller steps are slip;
 class Hypotheses:
     """What may have changed: P directions (q, P) in the space of q, Eq. (G1), each per unit of its name.
 
-    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. untold (q, q):
+    values (P,): the calibration's. kinds, units: of each. largest (P,): changes that are believed. prior (q, q):
     covariance P of Eq. (G3).
     """
 
@@ -41,7 +41,7 @@ class Hypotheses:
     values: Array
     directions: Array
     largest: Array
-    untold: Array
+    prior: Array
 
     @classmethod
     def of(cls, calibration: Calibration) -> Hypotheses:
@@ -70,11 +70,11 @@ class Hypotheses:
         directions = np.zeros((count, len(rows) + 1))
         directions[:size, : len(rows)] = np.column_stack([row[4] for row in rows])
         directions[-1, -1] = 1.0
-        untold = np.zeros((count, count))
+        prior = np.zeros((count, count))
         if calibration.covariance is None:
-            untold[:size, :size] = np.diag(np.repeat((_UNSTATED * robot.row_scales) ** 2, matrix.shape[1]))
+            prior[:size, :size] = np.diag(np.repeat((_UNSTATED * robot.row_scales) ** 2, matrix.shape[1]))
         else:
-            untold[:size, :size] = np.array(calibration.covariance)[:size, :size]
+            prior[:size, :size] = np.array(calibration.covariance)[:size, :size]
         return cls(
             (*(row[0] for row in rows), "reference_clock"),
             (*(row[1] for row in rows), "reference"),
@@ -82,7 +82,7 @@ class Hypotheses:
             np.array([*(row[3] for row in rows), 0.0]),
             directions,
             np.array([*(_LARGEST_SHARE * _size(row) for row in rows), 3.0]),
-            untold,
+            prior,
         )
 
 

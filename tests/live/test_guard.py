@@ -92,6 +92,24 @@ def test_the_wheel_that_changed_is_named_with_its_radius_and_proposed(robot: tup
     assert later.value == pytest.approx(changed.wheels[wheel][0], rel=5e-4)
 
 
+def test_two_changes_one_after_the_other_are_both_accepted() -> None:
+    rng = np.random.default_rng(4)
+    truth = Truth.drawn("differential", rng)
+    calibration = calibrated(truth, rng)
+    smaller = truth.changed("radius_left", -0.01)
+    wider = smaller.changed("track", 0.015)
+    drive = driven(truth, commands("differential", 900.0, rng), rng, (CHANGED, smaller), (3 * CHANGED, wider))
+    guard = told(calibration, drive)
+    assert [alarm.name for alarm in guard.alarms] == ["radius_left", "track"]
+    assert [(each.name, each.verdict) for each in guard.proposals] == [
+        ("radius_left", "accepted"),
+        ("track", "accepted"),
+    ]
+    radius, track = (each.value for each in guard.proposals)
+    assert radius == pytest.approx(smaller.wheels["left"][0], rel=1e-3)
+    assert track == pytest.approx(wider.wheels["left"][2] - wider.wheels["right"][2], rel=2e-3)
+
+
 def test_a_proposal_is_taken_back_when_later_motion_is_as_before(robot: tuple[Truth, Calibration]) -> None:
     truth, calibration = robot
     wheel = next(iter(truth.wheels))
