@@ -49,11 +49,10 @@ from scipy.stats import norm
 
 from omnibench.config import to_yaml
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Extended, Fit, at_runs, columns_of
-from omnibench.discover.regressors.significance import Group
-from omnibench.discover.result import Experiment, ExperimentCommand, NamedEffect
-from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
-from omnibench.discover.selection.model_selection import SURE
+from omnibench.discover.fit import Extended, Fit, at_runs, columns_of
+from omnibench.discover.result import SURE, Experiment, ExperimentCommand, NamedEffect
+from omnibench.discover.select import DISCREPANCY, tempered_evidence
+from omnibench.discover.significance import Group
 from omnibench.fit.trajectory_fit import Given, Whitened
 from omnibench.report.numbers import listing
 from omnibench.robot.calibration import matrix_rows
@@ -302,7 +301,7 @@ class Separation:
         rank = np.array([float(len(columns)) for columns in self.members.columns])[:, None, None]
         chi_square = explained.reshape(shape)
         tempered = 1 + DISCREPANCY**2 * np.maximum((chi_square - rank).max(axis=-3), 0.0)  # Eq. (3) of evidence.py
-        evidence = log_evidence(chi_square / tempered[..., None, :, :], rank, 0.0)
+        evidence = tempered_evidence(chi_square / tempered[..., None, :, :], rank, 0.0)
         evidence = evidence - np.log(self.members.tries)[:, None, None]
         own = np.arange(count)
         odds = evidence[..., own, own, :][..., None, :, :] - evidence  # Eq. (2); j, i, draw

@@ -50,9 +50,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fitting import Extended, Fit, at_runs, columns_at, extend, inliers_of, model_with
-from omnibench.discover.regressors.significance import Group
+from omnibench.discover.fit import Extended, Fit, at_runs, columns_at, extend, inliers_of, model_with
 from omnibench.discover.result import Extrapolation, Gap, HeldOut, Step
+from omnibench.discover.significance import Group
 from omnibench.errors import DataError
 from omnibench.fit.evaluate import final_errors
 from omnibench.fit.noise import grouped, repeating_runs, whiteners

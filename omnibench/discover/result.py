@@ -24,6 +24,10 @@ from omnibench.words import plural
 
 Verdict = Literal["none", "named", "class", "incomplete", "unknown"]
 CALIBRATION_FILES = {"extended": "model.yaml", "plain": "plain.yaml"}
+SURE = 0.95  # weight of a name from which on it counts as sure, as the verdict "named" is defined
+# Probability that an effect is named where none is missing: in one robot of 500. With half or twice of it no verdict
+# changes (tests/studies/constants.py).
+CHANCE = 0.002
 _FEW_RUNS = 10  # with fewer, the signs of runs flip in less than 2^9 ways, and no chance falls below CHANCE, 0.002
 _FEW_COMMANDS = 4  # up to three motions are what some matrix makes of any wheel rates: nothing contradicts it
 _NOT_WRITTEN = Field(exclude=True)
@@ -102,6 +106,11 @@ class CovariateDependence:
     description: str
     within_ticks: bool = False
     weight: float = 1.0
+
+    @property
+    def counts(self) -> bool:
+        """True for a dependence that is neither chance nor possibly encoder quantisation."""
+        return self.p_value < CHANCE and not self.within_ticks
 
 
 @dataclass(frozen=True)
@@ -231,6 +240,49 @@ class Experiment:
     chance: float = 0.0
     chance_recorded: float = 0.0
     inseparable: tuple[tuple[str, str], ...] = ()
+
+
+def verdict_of(
+    effects: Sequence[NamedEffect], where: Sequence[CovariateDependence], left: Sequence[CovariateDependence]
+) -> Verdict:
+    """The verdict. where, left: what the residuals depend on before and after the effects.
+
+    Motors are a stage of their own: naming what they do explains nothing that the odometry gets wrong. What a
+    controller does without a name is reported in words, and is nothing that the odometry lacks.
+    """
+    of_odometry = _of_stage(effects, where, left, motors=False)
+    if of_odometry != "none":
+        return of_odometry
+    of_motors = _of_stage(effects, where, left, motors=True)
+    whole: dict[Verdict, Verdict] = {"unknown": "none", "incomplete": "named"}
+    return whole.get(of_motors, of_motors)
+
+
+def lacks_a_name(verdict: Verdict) -> bool:
+    """True if something is missing that no effect explains."""
+    return verdict in ("unknown", "incomplete")
+
+
+def _of_stage(
+    effects: Sequence[NamedEffect],
+    where: Sequence[CovariateDependence],
+    left: Sequence[CovariateDependence],
+    *,
+    motors: bool,
+) -> Verdict:
+    """The verdict on the motors alone, or on the odometry alone."""
+    of_stage = [effect for effect in effects if (effect.stage == "actuator") == motors]
+    before, after = (
+        any(dependence.counts and (dependence.stage == "actuator") == motors for dependence in dependences)
+        for dependences in (where, left)
+    )
+    if not of_stage:
+        return "unknown" if before else "none"
+    if all(effect.weight >= SURE for effect in of_stage):
+        return "incomplete" if after else "named"
+    if all(effect.class_weight >= SURE for effect in of_stage):
+        return "class"
+    return "incomplete" if any(effect.weight >= SURE for effect in of_stage) else "unknown"
 
 
 def is_other_session(training: Sequence[Trajectory], held_out: Sequence[Trajectory]) -> bool:

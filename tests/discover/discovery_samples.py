@@ -10,7 +10,7 @@ from shared_results import made_once
 from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.discover import result
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import Fit, fit_matrix
+from omnibench.discover.fit import Fit, fit_matrix
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset

@@ -7,7 +7,7 @@ import numpy as np
 from discovery_samples import APR02
 
 from omnibench.data.dataset import Split, Trajectory
-from omnibench.discover.fitting import Extended, Fit
+from omnibench.discover.fit import Extended, Fit
 from omnibench.fit.noise import NoiseEstimate
 from omnibench.fit.trajectory_fit import Nuisances
 from omnibench.robot.calibration import Noise

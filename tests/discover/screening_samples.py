@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import ColumnStore, Group
-from omnibench.discover.selection.evidence import Groups
-from omnibench.discover.selection.model_selection import Screening
+from omnibench.discover.covariates import Basis
+from omnibench.discover.screening import Groups, Screening
+from omnibench.discover.significance import ColumnStore, Group
 from omnibench.fit.trajectory_fit import Whitened
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import Parameter

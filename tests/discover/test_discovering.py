@@ -22,7 +22,8 @@ from omnibench.discover.discover import discover_effects
 from omnibench.discover.held_out import validation_runs
 from omnibench.discover.report.discovery_report import discovery_report
 from omnibench.discover.result import Discovery
-from omnibench.discover.selection.model_selection import Screening, Selection
+from omnibench.discover.screening import Screening
+from omnibench.discover.select import Selection
 from omnibench.errors import DataError, UnknownNameError
 from omnibench.fit.evaluate import evaluate
 from omnibench.progress import Progress
@@ -167,18 +168,18 @@ def test_steps_come_in_order_confirming_only_with_an_effect() -> None:
 def test_an_effect_that_was_given_up_is_kept_if_fitted_in_full_it_explains_most_of_what_was_left(
     left_share: float, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    select = discover.select_effects
+    usual = select.select_effects
     given_up: list[Selection] = []
 
     def giving_up_at_first(screening: Screening, rng: np.random.Generator) -> Selection:
-        selection = select(screening, rng)
+        selection = usual(screening, rng)
         if given_up:
             return selection
         tentative = selection.chosen
         given_up.append(replace(selection, chosen=(), stand_ins=(), tentative=tentative, left_share=left_share))
         return given_up[0]
 
-    monkeypatch.setattr(discover, "select_effects", giving_up_at_first)
+    monkeypatch.setattr(select, "select_effects", giving_up_at_first)
     assert [effect.name for effect in discover.discover_effects(simulated(commands=SMALL)).effects] == names
 
 

@@ -37,15 +37,22 @@ from wheeled_samples import driven
 from omnibench.config import validate
 from omnibench.data.dataset import Trajectory
 from omnibench.data.splits import joined
-from omnibench.discover import fitting
+from omnibench.discover import fit as fitting
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.experiments import Choice, Members, Separation, candidate_runs, choose_runs, description_of
-from omnibench.discover.regressors.fine_structure import fine_structure
-from omnibench.discover.regressors.paths import slopes_by, slopes_by_delay
-from omnibench.discover.regressors.significance import Family, Group, Significance, significance_of, together
+from omnibench.discover.fine_structure import fine_structure
+from omnibench.discover.paths import slopes_by, slopes_by_delay
 from omnibench.discover.report.figures import motor_grid
 from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
-from omnibench.discover.selection.evidence import DISCREPANCY, log_evidence
+from omnibench.discover.select import DISCREPANCY
+from omnibench.discover.significance import (
+    Family,
+    Group,
+    Significance,
+    log_evidence,
+    significance_of,
+    together,
+)
 from omnibench.fit.noise import Whitener
 from omnibench.fit.trajectory_fit import Whitened, usable_runs
 from omnibench.registry import effects
@@ -719,7 +726,7 @@ def odds(information: Array, scores: Array, noise: Array) -> float:
         return np.array(of) - seen[0] ** 2 / information[0, 0]
 
     tempered = 1 + DISCREPANCY**2 * (explained(scores).max() - 1)
-    right, wrong = log_evidence(explained(scores + math.sqrt(tempered) * noise) / tempered, np.ones(2), 0.0)
+    right, wrong = log_evidence(explained(scores + math.sqrt(tempered) * noise) / tempered, np.ones(2))
     return float(right - wrong)
 
 

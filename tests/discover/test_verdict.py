@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
-from omnibench.discover.discover import headline_of, lacks_a_name, verdict_of
-from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict
+from omnibench.discover.conclude import headline_of
+from omnibench.discover.result import CovariateDependence, NamedEffect, Verdict, lacks_a_name, verdict_of
 from omnibench.robot.effects.effect import Stage
 
 

@@ -32,13 +32,10 @@ RUNS = "omnibench.fit.trajectory_fit"  # what discover begins with
 FACTORS = (0.5, 2.0)
 SURE = 0.95  # weight from which on a name is stated with confidence: the verdict "named" in the design
 # What is the same whatever the constants after the screening are, and what none of those before the end can change.
-FRONT = ("usable_runs", "_start_matrix", "fit_matrix", "screen_plain", "screen_extended", "screen_again", "extend",
-         "without_effects")  # fmt: skip
-TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of")
-OF_FRONT = ("fitting", "regressors.covariate_bases", "regressors.paths",
-            "selection.screening", "selection.candidate_groups", "selection.encoder_quantisation", "conclude",
-            RUNS)  # fmt: skip
-OF_TAIL = ("held_out",)
+FRONT = ("usable_runs", "fit_matrix", "make_groups", "screen", "extend", "without_effects")
+TAIL = ("validation_runs", "compare_held_out", "waterfall_steps", "extrapolations_of", "calibration_of_fit")
+OF_FRONT = ("fit", "covariates", "paths", "screening", RUNS)
+OF_TAIL = ("held_out", "conclude")
 
 
 class Set(Model):

@@ -1,4 +1,4 @@
-"""Study of what right and wrong names leave: the numbers in omnibench.discover.selection.evidence.
+"""Study of what right and wrong names leave: the numbers in omnibench.discover.select.
 
     python tests/studies/evidence_study.py --out evidence.jsonl [--seeds 2] [--table]
 
@@ -27,10 +27,11 @@ from hidden.sets import LEVELS, FormName, Kind, make_set
 from results_file import ResultsFile
 
 from omnibench.config import Model
-from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.significance import Group, significance_of
-from omnibench.discover.selection.evidence import credibility_of, effect_sets, indices_of, joint_share
-from omnibench.discover.selection.model_selection import ABSORBED, SURE, Screening, screen_again, screen_plain
+from omnibench.discover.fit import extend, fit_matrix
+from omnibench.discover.result import SURE
+from omnibench.discover.screening import Screening, make_groups, screen
+from omnibench.discover.select import credibility_of, effect_sets, indices_of, joint_share
+from omnibench.discover.significance import Group, significance_of
 from omnibench.fit.trajectory_fit import Given, usable_runs
 from omnibench.processes import one_thread
 
@@ -86,23 +87,24 @@ def measured(kind: Hidden, effects: tuple[str, ...], seed: int) -> Result:
     dataset, _ = make_set(of_set[0], effects, LEVELS["strong"], seed, form=of_set[1])
     runs = usable_runs(dataset.split("train"))
     plain = fit_matrix(runs, dataset.robot, dataset.sample_period, dataset.robot.inverse_kinematic_matrix)
-    screening = screen_plain(plain, ())
+    screening = screen(plain, plain.nuisance_free_residuals, make_groups(plain, ()))
     right = _best_shapes(screening, effects) if kind != "outside" else []
     explained, discrepancy = [], ()
     if right:
-        screening = screen_again(extend(plain, right), screening)
+        extended = extend(plain, right)
+        screening = screen(extended.fit, extended.residuals_without_effects, screening.groups)
         right = _best_shapes(screening, effects)
         explained.append(_names(screening, right, rng, right=True))
-        discrepancy = _discrepancy(screening.beyond_matrix(), right, _others(screening, effects))
+        discrepancy = _discrepancy(screening.beyond_matrix, right, _others(screening, effects))
     for count in (1, 2):
-        wrong = _largest(screening.beyond_matrix(), _others(screening, effects), count)
+        wrong = _largest(screening.beyond_matrix, _others(screening, effects), count)
         explained.append(_names(screening, wrong, rng, right=False))
     return Result(kind=kind, effects=effects, seed=seed, explained=tuple(explained), discrepancy=discrepancy)
 
 
 def _best_shapes(screening: Screening, names: Sequence[str]) -> list[Group]:
     """The shape of each named effect that explains most."""
-    start = screening.beyond_matrix()
+    start = screening.beyond_matrix
     return [
         max((g for g in screening.groups.effects if g.name == name), key=lambda group: start.chi_square(group.index))
         for name in names
@@ -111,8 +113,7 @@ def _best_shapes(screening: Screening, names: Sequence[str]) -> list[Group]:
 
 def _others(screening: Screening, names: Sequence[str]) -> list[Group]:
     """All other effects that are not absorbed, each in its best shape."""
-    start = screening.beyond_matrix()
-    other = {group.name for group in screening.groups.effects if start.share_left(group.index) > ABSORBED} - set(names)
+    other = {group.name for group in screening.tellable} - set(names)
     return _best_shapes(screening, sorted(other))
 
 
@@ -130,7 +131,7 @@ def _discrepancy(start: Given, right: Sequence[Group], others: Sequence[Group]) 
 
 
 def _names(screening: Screening, chosen: Sequence[Group], rng: np.random.Generator, *, right: bool) -> Names:
-    data, bases, start = screening.data, screening.groups.bases, screening.beyond_matrix()
+    data, bases, start = screening.data, screening.groups.bases, screening.beyond_matrix
     fitted = screening.index_with(chosen)
     forms = [index for group in chosen for index in group.forms]
     left, beyond = (significance_of(data, columns, bases, rng) for columns in (fitted, [*fitted, *forms]))

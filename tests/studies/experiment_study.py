@@ -25,13 +25,13 @@ from hidden.sets import make_set
 from results_file import ResultsFile
 from scipy.stats import binomtest
 
-import omnibench.discover.discover as discovering
+import omnibench.discover.confirm as confirming
 from omnibench.config import Model, parse_yaml
 from omnibench.data.dataset import Dataset
 from omnibench.data.splits import joined as joined_datasets
+from omnibench.discover.confirm import CompetingModels
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.result import Discovery, NamedEffect
-from omnibench.discover.selection.competing_models import CompetingModels
 from omnibench.processes import one_thread
 from omnibench.robot.calibration import EffectTerm
 from omnibench.simulate.config import FlowerConfig
@@ -141,17 +141,17 @@ def omni3_sets(dataset: Dataset, seeds: Sequence[int], done: set[str]) -> Iterat
 def discovered_with_models(dataset: Dataset) -> tuple[Discovery, CompetingModels]:
     """What is discovered, and the models that the recordings cannot tell apart."""
     kept: list[CompetingModels] = []
-    compete = discovering.competing_models
+    compete = confirming.competing_models
 
     def keeping(*arguments: Any) -> CompetingModels:
         kept.append(compete(*arguments))
         return kept[-1]
 
-    discovering.competing_models = keeping
+    confirming.competing_models = keeping
     try:
         return discover_effects(dataset), kept[-1]
     finally:
-        discovering.competing_models = compete
+        confirming.competing_models = compete
 
 
 def _part(dataset: Dataset, minutes: float, seed: int) -> Dataset:

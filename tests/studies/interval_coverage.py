@@ -39,8 +39,8 @@ from results_file import ResultsFile, in_processes
 from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.significance import Group
+from omnibench.discover.fit import extend, fit_matrix
+from omnibench.discover.significance import Group
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array, Robot, Wheel

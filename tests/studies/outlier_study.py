@@ -27,8 +27,8 @@ from scipy.stats import binomtest
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.significance import Group
+from omnibench.discover.fit import extend, fit_matrix
+from omnibench.discover.significance import Group
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects

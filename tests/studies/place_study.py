@@ -17,10 +17,11 @@ from hidden.forms import FORMS
 from hidden.outside import OUTSIDE
 from hidden.sets import make_set
 
-from omnibench.discover.fitting import fit_matrix
-from omnibench.discover.regressors.significance import Significance, significance_of
-from omnibench.discover.selection import model_selection
-from omnibench.discover.selection.model_selection import CHANCE, screen_plain, weights_of_covariates
+from omnibench.discover import locate as locating
+from omnibench.discover.fit import PlainFit, fit_matrix
+from omnibench.discover.locate import locate, weights_of_covariates
+from omnibench.discover.result import CHANCE
+from omnibench.discover.significance import Significance
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread
 from omnibench.registry import effects
@@ -39,8 +40,7 @@ def seen(levels: list[float]) -> Iterator[tuple[str, tuple[str, ...], Significan
             dataset, _ = make_set("outside" if outside else "single", name, level, seed, design=design)
             runs, start = usable_runs(dataset.split("train")), dataset.robot.inverse_kinematic_matrix
             plain = fit_matrix(runs, dataset.robot, dataset.sample_period, start)
-            screening = screen_plain(plain, [entry.name for entry in effects.entries()])
-            found = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
+            found = locate(PlainFit(dataset, plain), [entry.name for entry in effects.entries()], rng).where
             if found.p_value(found.best) < CHANCE:
                 yield name, OUTSIDE[name].covariates if outside else (effects.create(name).shows_in,), found
 
@@ -51,11 +51,11 @@ def main() -> None:
     parser.add_argument("--levels", type=float, nargs="+", default=[150.0, 1000.0])
     parser.add_argument("--factors", type=float, nargs="+", default=[0.5, 1.0, 1.5])
     arguments = parser.parse_args()
-    usual = model_selection._OF_BASES
+    usual = locating._OF_BASES
     with one_thread():
         sets = list(seen(arguments.levels))
     for factor in arguments.factors:
-        model_selection._OF_BASES = factor * usual
+        locating._OF_BASES = factor * usual
         answers = []
         for name, right, found in sets:
             weights = weights_of_covariates(found)

@@ -22,8 +22,8 @@ from hidden.session_sets import session_set
 from results_file import ResultsFile
 
 from omnibench.data.dataset import Dataset
-from omnibench.discover.fitting import extend, fit_matrix
-from omnibench.discover.regressors.significance import Group
+from omnibench.discover.fit import extend, fit_matrix
+from omnibench.discover.significance import Group
 from omnibench.fit.sessions import SessionComparison, compare_sessions
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.processes import one_thread

@@ -15,7 +15,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.paths import slopes_by_delay
+from omnibench.discover.paths import slopes_by_delay
 from omnibench.discover.report import tables
 from omnibench.discover.report.residuals import NORMAL_95, Residuals, shares
 from omnibench.discover.result import Discovery, Gap

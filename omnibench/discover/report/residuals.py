@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.paths import Paths, make_paths
+from omnibench.discover.paths import Paths, make_paths
 from omnibench.discover.result import Discovery
 from omnibench.fit.noise import Whitener, grouped
 from omnibench.robot.kinematics import Array, rotation

@@ -8,7 +8,7 @@ from typing import Literal
 
 from omnibench.data.dataset import Dataset
 from omnibench.discover import result
-from omnibench.discover.selection.model_selection import SURE
+from omnibench.discover.result import SURE
 from omnibench.registry import effects
 from omnibench.report.blocks import Cell, Column, Row, Table
 from omnibench.report.numbers import NOTHING, count, decimals_for, fixed, percent, significant, span, with_unit

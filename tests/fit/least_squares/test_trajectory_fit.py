@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.fitting import fit_matrix, with_noise
+from omnibench.discover.fit import fit_matrix, with_noise
 from omnibench.errors import DataError
 from omnibench.fit.linear_fit import bounded_step
 from omnibench.fit.noise import (

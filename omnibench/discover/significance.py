@@ -29,6 +29,19 @@ k - 1 lie, by maximum likelihood:
 How much the group that stands out most explains beyond chance, in standard deviations of a chi-square, is
 
     surplus = max over groups of w - mean over flips of their max of w,    w = (Q - d v) / (v sqrt(2 d)).          (4)
+
+Bayes factor. Let the residuals of all runs, whitened, be X b + e with e ~ N(0, I), where X are the d columns of a group
+and Q the chi-square difference that they make. With Zellner's g-prior b ~ N(0, g (X'X)^-1) the Bayes factor of the
+group against nothing is
+
+    B(g) = (1 + g)^(-d/2) exp(Q g / (1 + g) / 2),                                                                  (5)
+
+largest at g = Q / d - 1, where 2 ln B is the conditional maximum likelihood criterion of George and Foster
+("Calibration and empirical Bayes variable selection", Biometrika 87, 2000):
+
+    2 ln B = Q - d (1 + max(ln(Q / d), 0)).                                                                        (6)
+
+Below Q = d, where no g raises (5) above 1, (6) is negative, as their criterion is: to explain little costs.
 """
 
 from __future__ import annotations
@@ -45,7 +58,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from omnibench.discover.regressors.covariate_bases import Basis
+from omnibench.discover.covariates import Basis
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.robot.effects.effect import Effect, Forms, Parameter
 from omnibench.robot.kinematics import Array
@@ -375,4 +388,11 @@ def _evidence(chi_square: Array, rank: Array, spread: Array, tries: Array) -> Ar
     with np.errstate(divide="ignore"):
         single = -np.log10(chdtrc(freedom, scaled))
     evidence: Array = np.where(rank > 0, np.maximum(single - np.log10(tries), 0.0), 0.0)
+    return evidence
+
+
+def log_evidence(chi_square: Array, rank: Array) -> Array:
+    """Logarithms of Bayes factors (n,) of chi-square differences with so many degrees of freedom, Eq. (6)."""
+    growth = np.log(np.maximum(chi_square / np.maximum(rank, 1), 1.0))
+    evidence: Array = (chi_square - rank - rank * growth) / 2
     return evidence

@@ -1,4 +1,4 @@
-"""Competing models: those that the recordings cannot tell apart, which of them is used, and its named effects.
+"""Step 5, confirm: matrix and effects fitted anew with the noise, held-out runs, and whether anything is left.
 
 Where several effects explain the same residuals, each in its place makes a model of its own. The one that best predicts
 commands that its fit did not see, in the paper's cost, is used; what the models disagree on is not known.
@@ -22,165 +22,132 @@ all, and with the first two moments of the mixture:
 
     t = sum of w_c t_c,    S = sum of w_c (S_c + (t_c - t)(t_c - t)').                                              (2)
 
-Named effects have 95 % intervals by the fit's covariance and Student's t, fit/information.py.
-
-Detectability: limits of what recordings can tell of effects.
-
-Absorbed effects, classes of effects that look alike, sums of effects that imitate another, and how large an effect
-could still hide. With I the information of all columns beyond the matrix, the share of the signature of an effect with
-columns i that the columns j of others make is
-
-    a = tr(I_ij I_jj^+ I_ji) / tr(I_ii).                                                                           (1)
-
-What they do not make tells the effect from them with a non-centrality of (1 - a) N, N being its own. By Eq. (2) and (3)
-of evidence.py the log odds approach (1 - a) N / (2 (1 + delta^2 N)), which no size of the effect raises above
-
-    (1 - a) / (2 delta^2).                                                                                         (2)
-
-With b the estimate of a parameter and sigma its standard error, the parameter lies within
-
-    |b| + z(0.975) sigma,                                                                                          (3)
-
-and is found nearly always from z(1 - alpha / (2 G)) sigma + z(0.93) sigma on, as the largest of G effects at the chance
-alpha (Bonferroni).                                                                                                (4)
+Named effects have 95 % intervals by the fit's covariance and Student's t, fit/intervals.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from omnibench.discover.fitting import Extended, Fit, at_model, columns_of, extend, model_with, terms_of
+from omnibench.discover import held_out as validating
+from omnibench.discover.fine_structure import fine_structure
+from omnibench.discover.fit import (
+    Extended,
+    Fit,
+    at_model,
+    columns_of,
+    extend,
+    model_with,
+    terms_of,
+    without_effects,
+)
 from omnibench.discover.held_out import folds_of_commands, held_out_residuals, is_gain
-from omnibench.discover.regressors.significance import Group, best_shapes
-from omnibench.discover.result import Absorbed, Candidate, EstimatedParameter, Hidden, NamedEffect
-from omnibench.discover.selection.evidence import Missing
-from omnibench.discover.selection.model_selection import ABSORBED, SURE, MotorEffects, Screening, Selection
-from omnibench.fit.trajectory_fit import Given, given
-from omnibench.registry import effects
+from omnibench.discover.locate import dependences_on, remaining
+from omnibench.discover.result import (
+    SURE,
+    Candidate,
+    CovariateDependence,
+    EstimatedParameter,
+    NamedEffect,
+    lacks_a_name,
+    verdict_of,
+)
+from omnibench.discover.screening import Screening, screen
+from omnibench.discover.select import MotorEffects, Selected, Selection, select_effects
+from omnibench.discover.significance import Group, significance_of, together
+from omnibench.discover.spline_term import add_smooth_terms
+from omnibench.fit.trajectory_fit import given
 from omnibench.robot.effects.effect import form_in_words
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.physical import EstimatedCovariance
 
-_ALIKE = 0.95  # a, Eq. (1), of one class: log odds of at most 2.5, Eq. (2), a weight below that of a sure name
-_SUM = 0.98  # a, Eq. (1), of several effects that imitate one: log odds of at most 1, Eq. (2)
-_TOGETHER = 3  # effects that imitate one together, at most: as many as are named together
-_SEARCHED, _FEW = 6, 3  # the effects that make most by themselves, of up to three columns, are put together: 35 sums
-_NORMAL_95 = 1.96  # z(0.975)
-_DETECTED = 5.5  # Eq. (4) for a chance of 0.002 and 30 to 40 effects: 4.0 + 1.5 standard errors
 
+@dataclass(frozen=True, eq=False)
+class Confirmed:
+    """The models that held-out runs confirm, and what is left.
 
-@dataclass(frozen=True)
-class Detectability:
-    """Limits of what recordings can tell of effects.
-
-    absorbed: effects that the matrix reproduces. not_looked_for: effects with what the recordings lack for them.
-    classes: names of effects that look alike. sums: effects, and the others that imitate each together. hidden: sizes
-    that could still hide.
+    screening, models: what the effects were selected by with the noise that they leave, and the models with them.
+    effects: those with a name. where, left: what the residuals depend on without effects and beside all that the model
+    in use holds. average: of the competing models. baseline, extended: the plain matrix, and their average, which fades
+    outside the training domain, under the same noise. folds (Z,): in which each run was held out. notes: on terms
+    without a name.
     """
 
-    absorbed: tuple[Absorbed, ...]
-    not_looked_for: tuple[tuple[str, Missing], ...]
-    classes: tuple[tuple[str, ...], ...]
-    sums: tuple[tuple[str, tuple[str, ...]], ...]
-    hidden: tuple[Hidden, ...]
+    selected: Selected
+    screening: Screening
+    models: CompetingModels
+    effects: tuple[NamedEffect, ...]
+    where: tuple[CovariateDependence, ...]
+    left: tuple[CovariateDependence, ...]
+    average: AveragedModel
+    baseline: Extended
+    extended: Extended
+    folds: NDArray[np.intp]
+    notes: tuple[str, ...]
 
 
-def detectability_of(screening: Screening, selection: Selection) -> Detectability:
-    """Detectability of effects beyond the matrix, and sizes that could hide beside the selected effects."""
-    # One group for each effect that is not absorbed: the shape with the largest chi-square difference
-    start = screening.beyond_matrix()
-    tellable = [group for group in screening.groups.effects if start.share_left(group.index) >= ABSORBED]
-    best = best_shapes(tellable, [start.chi_square(each.index) for each in tellable])
-    visible = [tellable[index] for index in best]
-    # Effects that a matrix reproduces in these recordings, with the measurement that would tell them
-    absorbed = {
-        group.name: Absorbed(group.name, group.effect.stage, group.effect.measurement or "another kind of motion")
-        for group in screening.groups.effects
-        if group.effect is not None and start.share_left(group.index) < ABSORBED
-    }
-    for name, missing in screening.groups.not_looked_for:
-        if missing is Missing.SECOND_SESSION:
-            effect = effects.create(name)
-            absorbed[name] = Absorbed(name, effect.stage, effect.measurement or "recordings of another session")
-    return Detectability(
-        absorbed=tuple(absorbed.values()),
-        not_looked_for=screening.groups.not_looked_for,
-        classes=_classes(start, visible),
-        sums=_sums(start, visible),
-        hidden=_hidden(screening, selection, visible),
+def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool = True) -> Confirmed:
+    """Confirm the selected effects. unknown_term: add a term without a name where no name is sure."""
+    plain = selected.proposal.located.plain.fit
+    screening, selection, extended = selected.screening, selected.selection, selected.extended
+    if selection.chosen:  # once more, now that the noise is known better
+        screening = screen(extended.fit, extended.residuals_without_effects, screening.groups)
+        again = select_effects(screening, rng)
+        if not again.is_same_as(selection):
+            extended = extend(plain, again.chosen)
+        selection = again
+    models = with_fitted_forms(plain, screening, competing_models(plain, selection, extended))
+    chosen = models.selection.chosen
+
+    # What the residuals depend on, before the effects and after them
+    baseline = without_effects(plain, models.used)
+    bases = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
+    without = together(bases, fine_structure(baseline.fit, rng))
+    beside = remaining(models.used, screening, rng) if chosen else without
+
+    # Where no name is sure, the gap is closed by a term without one
+    motors, notes = selected.motors, tuple[str, ...]()
+    effects = named_effects(models, motors)
+    folds = validating.random_folds_of_repetitions(plain.runs, rng)
+    where = dependences_on(without, "", screening.quantisation_chi_square)
+    left = dependences_on(beside, "still ", lambda group: screening.quantisation_chi_square(group, chosen))
+    if unknown_term and lacks_a_name(verdict_of(effects, where, left)):
+        term = add_smooth_terms(
+            plain, screening, models.used, beside, lambda model: remaining(model, screening, rng), folds
+        )
+        notes = term.notes
+        if term.terms:
+            left = dependences_on(term.left, "still ", lambda group: screening.quantisation_chi_square(group, chosen))
+            others = [(weight, extend(plain, [*model.groups, *term.terms])) for weight, model in models.weighted[1:]]
+            models = replace(models, used=term.model, weighted=((models.weighted[0][0], term.model), *others))
+            effects = named_effects(models, motors)
+    if motors is not None:
+        where += dependences_on(motors.where)
+        left += dependences_on(motors.selection.left, "still ")
+
+    average = averaged(models.weighted)
+    baseline = without_effects(plain, average.extended)
+    extended = validating.faded(average.extended, baseline)
+    return Confirmed(
+        selected=selected,
+        screening=screening,
+        models=models,
+        effects=effects,
+        where=tuple(sorted(where, key=lambda dependence: (dependence.p_value, -dependence.excess))),
+        left=tuple(left),
+        average=average,
+        baseline=baseline,
+        extended=extended,
+        folds=folds,
+        notes=notes,
     )
 
 
-def _classes(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, ...], ...]:
-    """Effects of which one makes at least 95 % of another's signature; pairs that share one are one class."""
-    joined = {group.name: {group.name} for group in visible}
-    for first, second in combinations(visible, 2):
-        if max(_made_by(start, first, second), _made_by(start, second, first)) > _ALIKE:
-            together = joined[first.name] | joined[second.name]
-            for name in together:
-                joined[name] = together
-    return tuple(dict.fromkeys(tuple(sorted(names)) for names in joined.values() if len(names) > 1))
-
-
-def _sums(start: Given, visible: Sequence[Group]) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Effects whose signature up to three others make together (98 %) and no other alone: name and those others."""
-    sums = []
-    for group in visible:
-        others = sorted(
-            (other for other in visible if other is not group and len(other.index) <= _FEW),
-            key=lambda other: -_made_by(start, group, other),
-        )[:_SEARCHED]
-        if not others or _made_by(start, group, others[0]) > _ALIKE:
-            continue
-        for count in range(2, _TOGETHER + 1):
-            best = max(combinations(others, count), key=lambda some: _made_by(start, group, *some), default=())
-            if best and _made_by(start, group, *best) > _SUM:
-                sums.append((group.name, tuple(other.name for other in best)))
-                break
-    return tuple(sums)
-
-
-def _made_by(start: Given, group: Group, *others: Group) -> float:
-    """The share a of a group's signature that others make, Eq. (1)."""
-    index = [column for other in others for column in other.index]
-    rows = list(group.index)
-    roots = start.roots(index)
-    taken = start.information[np.ix_(rows, index)] @ roots
-    whole = float(np.trace(start.information[np.ix_(rows, rows)]))
-    return float(np.square(taken).sum()) / whole if whole > 0 else 0.0
-
-
-def _hidden(screening: Screening, selection: Selection, visible: Sequence[Group]) -> tuple[Hidden, ...]:
-    """Sizes of effects that were neither selected nor are confusable with one that was."""
-    excluded = {group.name for group in selection.chosen} | {name for names in selection.confusable for name in names}
-    spread = float(np.median(selection.left.spread))  # by how much chance exceeds the noise model
-    now = given(screening.data, screening.index_with(selection.chosen))
-    hidden = []
-    for group in visible:
-        if group.name in excluded:
-            continue
-        values, covariance = now.estimate(group.index)
-        errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) * spread)
-        hidden += [
-            Hidden(
-                group.name,
-                parameter.name,
-                parameter.unit,
-                float(abs(value) + _NORMAL_95 * error),  # Eq. (3)
-                float(_DETECTED * error),  # Eq. (4)
-                max(abs(parameter.low), abs(parameter.high)),
-            )
-            for parameter, value, error in zip(group.parameters, values, errors, strict=True)
-            if error > 0
-        ]
-    return tuple(hidden)
-
-
-# Share of a column that must be left beyond the others, as in unknown_term.py: much of a form is another matrix.
+# Share of a column that must be left beyond the others, as in spline_term.py: much of a form is another matrix.
 _DETERMINED = 0.01
 
 

@@ -15,7 +15,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.paths import Paths, slopes_by, slopes_by_delay
+from omnibench.discover.paths import Paths, slopes_by, slopes_by_delay
 from omnibench.robot.effects import smooth
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Stage
 from omnibench.robot.kinematics import Array

@@ -30,10 +30,10 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.fitting import Fit, paths_of
-from omnibench.discover.regressors.covariate_bases import Basis, area_of, patches_on_grid
-from omnibench.discover.regressors.paths import Paths
-from omnibench.discover.regressors.significance import Group, Significance, significance_of_scores, together
+from omnibench.discover.covariates import Basis, area_of, patches_on_grid
+from omnibench.discover.fit import Fit, paths_of
+from omnibench.discover.paths import Paths
+from omnibench.discover.significance import Group, Significance, significance_of_scores, together
 from omnibench.robot.effects.effect import Values
 from omnibench.robot.effects.smooth import MODES, beyond, bump
 from omnibench.robot.kinematics import Array

@@ -25,12 +25,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.discover.fitting import Extended, Fit, columns_of, extend
+from omnibench.discover.covariates import Basis
+from omnibench.discover.fit import Extended, Fit, columns_of, extend
 from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
-from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import Group, Significance, best_shapes
-from omnibench.discover.selection.competing_models import CompetingModels
-from omnibench.discover.selection.model_selection import CHANCE, Screening, weights_of_covariates
+from omnibench.discover.locate import weights_of_covariates
+from omnibench.discover.result import CHANCE
+from omnibench.discover.screening import Screening
+from omnibench.discover.significance import Group, Significance, best_shapes
 from omnibench.fit.trajectory_fit import Given, Whitened, given
 from omnibench.registry import effects
 from omnibench.robot.effects.smooth import smooth_joint
@@ -56,9 +57,10 @@ _LARGEST = 3.0  # times the plausible range: a larger coefficient stands for som
 
 @dataclass(frozen=True, eq=False)
 class SmoothTerm:
-    """The competing models with smooth terms, or as they were where none is added; what is left then; and notes."""
+    """Terms without a name, the model with these, or as it was where there are none; what is left then; and notes."""
 
-    models: CompetingModels
+    terms: tuple[Group, ...]
+    model: Extended
     left: Significance
     notes: tuple[str, ...]
 
@@ -85,12 +87,12 @@ class _Trial:
 def add_smooth_terms(
     plain: Fit,
     screening: Screening,
-    models: CompetingModels,
+    model: Extended,
     left: Significance,
     looking_again: Callable[[Extended], Significance],
     folds: NDArray[np.intp],
 ) -> SmoothTerm:
-    """Add terms without a name to all competing models, as long as runs that are held out gain by them.
+    """Add terms without a name to a model, as long as runs that are held out gain by them.
 
     A term is a set of smooth functions of a covariate that the residuals depend on most surely, or an effect of the
     catalogue that explains most and whose name is not sure. left: what the residuals depend on after the effects;
@@ -99,10 +101,10 @@ def add_smooth_terms(
     another, badly. folds (Z,): the fold in which each run is held out where no kind of motion can be, as a function of
     the command says nothing of others.
     """
-    kinds, notes = folds_of_kinds(plain), list[str]()
+    kinds, notes, terms = folds_of_kinds(plain), list[str](), list[Group]()
     if (count := screening.kinds or 0) < _KINDS:
         few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
-        return SmoothTerm(models, left, (few,))
+        return SmoothTerm((), model, left, (few,))
     for _ in range(_ROUNDS):
         # The covariates that are most likely what the residuals depend on, if that is no chance
         significant = {
@@ -113,9 +115,9 @@ def add_smooth_terms(
         trials = [
             trial
             for name in covariates
-            for trial in _trials(screening, models.used, left, name, folds if name == "command" else kinds)
+            for trial in _trials(screening, model, left, name, folds if name == "command" else kinds)
         ]
-        trials += _of_families(screening, models.used, kinds) if covariates and not notes else ()
+        trials += _of_families(screening, model, kinds) if covariates and not notes else ()
         best = max(trials, key=lambda trial: float(trial.gains.mean()), default=None)
         if best is None or not is_gain(best.gains):
             if not covariates:
@@ -128,11 +130,11 @@ def add_smooth_terms(
                 tried = f"{words} was tried and left out: on motions held out it gains {best.gained}."
             notes = notes or [tried]
             break
-        weighted = tuple((weight, extend(plain, [*model.groups, *best.terms])) for weight, model in models.weighted)
-        models = replace(models, used=weighted[0][1], weighted=weighted)
+        terms += best.terms
+        model = extend(plain, [*model.groups, *best.terms])
         notes.append(f"The extended model holds {best.words}: on motions held out it gains {best.gained}.")
-        left = looking_again(models.used)
-    return SmoothTerm(models, left, tuple(notes))
+        left = looking_again(model)
+    return SmoothTerm(tuple(terms), model, left, tuple(notes))
 
 
 def _trials(

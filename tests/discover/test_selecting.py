@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,46 +17,51 @@ from scipy.stats import ncx2
 from screening_samples import FIRST, FOURTH, MATRIX, PARAMETER, POSITIVE, SECOND, THIRD, screening
 
 from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.discover.confirm import CompetingModels, averaged, competing_models
+from omnibench.discover.covariates import Basis
 from omnibench.discover.discover import discover_effects
-from omnibench.discover.fitting import Extended, Fit, extend
+from omnibench.discover.fit import Extended, Fit, PlainFit, extend
 from omnibench.discover.held_out import group_counts, step_name
-from omnibench.discover.regressors.covariate_bases import Basis
-from omnibench.discover.regressors.significance import Family, Group, Significance, together
-from omnibench.discover.result import Discovery
-from omnibench.discover.selection import model_selection
-from omnibench.discover.selection.competing_models import (
-    CompetingModels,
-    Detectability,
-    averaged,
-    competing_models,
-    detectability_of,
-)
-from omnibench.discover.selection.evidence import (
-    Credibility,
+from omnibench.discover.locate import Located, dependences_on, weights_of_covariates
+from omnibench.discover.motors import fit_motors, screen_motors
+from omnibench.discover.propose import Proposal, hidden_sizes, propose
+from omnibench.discover.result import CovariateDependence, Discovery, Hidden
+from omnibench.discover.screening import (
+    EncoderQuantisation,
     Missing,
+    Screening,
+    make_groups,
+    quantisation_steps,
+    screen,
+)
+from omnibench.discover.select import (
+    Credibility,
+    Selection,
     bayes_factor,
     credibility_of,
     effect_sets,
-    log_evidence,
+    select_effects,
+    tempered_evidence,
 )
-from omnibench.discover.selection.model_selection import Dependences, covariate_dependences, weights_of_covariates
-from omnibench.discover.selection.unknown_term import add_smooth_terms
+from omnibench.discover.significance import Family, Group, Significance, log_evidence, significance_of, together
+from omnibench.discover.spline_term import add_smooth_terms
 from omnibench.fit.noise import Whitener
 from omnibench.registry import effects
 from omnibench.robot.calibration import Calibration
 from omnibench.robot.effects.effect import Parameter
 from omnibench.robot.kinematics import Robot
+from omnibench.robot.physical import EstimatedCovariance
 
 DRIFT, BIAS, SLIP = "heading_drift", "body_velocity_bias", "rotation_translation_coupling"
 FLOOR, LATENCY = "floor_drift", "heading_latency"
 BASES = {"heading": (FIRST + SECOND) / np.sqrt(2), "place": THIRD, "elapsed time": FOURTH}
 
 
-def selected(given: model_selection.Screening) -> model_selection.Selection:
-    return model_selection.select_effects(given, np.random.default_rng(0))
+def selected(given: Screening) -> Selection:
+    return select_effects(given, np.random.default_rng(0))
 
 
-def names(selection: model_selection.Selection) -> list[str]:
+def names(selection: Selection) -> list[str]:
     return [group.name for group in selection.chosen]
 
 
@@ -65,7 +71,6 @@ def test_the_effect_whose_column_the_residuals_follow_is_chosen_alone() -> None:
     assert found.weights[DRIFT] == pytest.approx(found.known)
     assert found.known > 0.99
     assert found.confusable == ((),)
-    assert found.where.p_value(0) < 1e-6
     assert found.left.p_value(found.left.best) > 0.1
 
 
@@ -128,10 +133,8 @@ def test_what_one_run_alone_shows_is_no_effect() -> None:
     given = screening({DRIFT: FIRST}, BASES, [0, 0, 0, 0, 0])
     residuals = (given.data.residuals[0] + 80 * FIRST, *given.data.residuals[1:])
     scores = np.array([each.T @ own for each, own in zip(given.data.columns, residuals, strict=True)])
-    again = model_selection.Screening(
-        given.groups, replace(given.data, residuals=residuals, scores=scores), given.folds
-    )
-    assert again.beyond_matrix().chi_square((1,)) == pytest.approx(80**2 / 20)
+    again = Screening(given.groups, replace(given.data, residuals=residuals, scores=scores), given.folds)
+    assert again.beyond_matrix.chi_square((1,)) == pytest.approx(80**2 / 20)
     assert selected(again).chosen == ()
 
 
@@ -151,39 +154,51 @@ def plain() -> Fit:
 
 
 @pytest.fixture(scope="module")
-def screened(plain: Fit) -> model_selection.Screening:
-    return model_selection.screen_plain(plain, LEFT_OUT)
+def screened(plain: Fit) -> Screening:
+    return screened_plain(plain, LEFT_OUT)
+
+
+def screened_plain(plain: Fit, without: Sequence[str] = ()) -> Screening:
+    return screen(plain, plain.nuisance_free_residuals, make_groups(plain, without))
+
+
+def screened_extended(extended: Extended) -> Screening:
+    return screen(extended.fit, extended.residuals_without_effects, make_groups(extended.fit, LEFT_OUT))
 
 
 @pytest.fixture(scope="module")
-def extended(plain: Fit, screened: model_selection.Screening) -> Extended:
+def extended(plain: Fit, screened: Screening) -> Extended:
     (coupling,) = (group for group in screened.groups.effects if group.name == "rotation_translation_coupling")
     return extend(plain, [coupling])
 
 
 def test_an_extended_model_is_screened_with_its_effects_put_back(extended: Extended) -> None:
-    again = model_selection.screen_extended(extended, LEFT_OUT)
+    again = screened_extended(extended)
     (coupling,) = (group for group in again.groups.effects if group.name == "rotation_translation_coupling")
-    values, _ = again.beyond_matrix().estimate(coupling.index)
+    values, _ = again.beyond_matrix.estimate(coupling.index)
     np.testing.assert_allclose(values, extended.values, rtol=0.05)
-    assert again.beyond_matrix().chi_square(coupling.index) > 10 * len(extended.values)
+    assert again.beyond_matrix.chi_square(coupling.index) > 10 * len(extended.values)
 
 
-def test_columns_are_made_once_for_both_screenings(screened: model_selection.Screening, extended: Extended) -> None:
-    assert model_selection.screen_again(extended, screened).groups is screened.groups
-    assert model_selection.screen_extended(extended, LEFT_OUT).groups is not screened.groups
-
-
-def test_effects_that_need_a_second_session_are_absorbed_in_a_single_one(screened: model_selection.Screening) -> None:
-    limits = detectability_of(screened, selected(screened))
+def test_effects_that_need_a_second_session_are_absorbed_in_a_single_one(screened: Screening) -> None:
+    limits = proposed(screened)
     of_sessions = {name for name, missing in limits.not_looked_for if missing is Missing.SECOND_SESSION}
     assert of_sessions
     assert of_sessions <= {effect.name for effect in limits.absorbed}
 
 
-def detectability(named: dict[str, np.ndarray], gains: tuple[float, ...] = (0, 0, 0, 0, 0)) -> Detectability:
+def proposed(screened: Screening) -> Proposal:
+    where = significance_of(screened.data, [0], screened.groups.bases, np.random.default_rng(0))
+    return propose(Located(PlainFit(Mock(Dataset), Mock(Fit)), screened, where, None))
+
+
+def limits(named: dict[str, np.ndarray]) -> Proposal:
+    return proposed(screening(named, {"place": FOURTH}, (0, 0, 0, 0, 0)))
+
+
+def hidden(named: dict[str, np.ndarray], gains: tuple[float, ...] = (0, 0, 0, 0, 0)) -> tuple[Hidden, ...]:
     given = screening(named, {"place": FOURTH}, gains)
-    return detectability_of(given, selected(given))
+    return hidden_sizes(given, selected(given).chosen, (), 1.0)
 
 
 def at(degrees: float) -> np.ndarray:
@@ -192,27 +207,27 @@ def at(degrees: float) -> np.ndarray:
 
 
 def test_an_effect_that_the_matrix_reproduces_is_absorbed_and_nothing_else_is_said_of_it() -> None:
-    found = detectability({DRIFT: MATRIX, BIAS: MATRIX + 0.02 * FIRST})
-    assert [each.name for each in found.absorbed] == [DRIFT]
-    assert [each.name for each in found.hidden] == [BIAS]
+    columns = {DRIFT: MATRIX, BIAS: MATRIX + 0.02 * FIRST}
+    assert [each.name for each in limits(columns).absorbed] == [DRIFT]
+    assert [each.name for each in hidden(columns)] == [BIAS]
 
 
 def test_effects_of_which_one_makes_most_of_the_other_are_one_class() -> None:
-    assert detectability({DRIFT: at(0), BIAS: at(12)}).classes == ((BIAS, DRIFT),)  # cos^2 = 0.957
-    assert detectability({DRIFT: at(0), BIAS: at(14)}).classes == ()  # cos^2 = 0.941
+    assert limits({DRIFT: at(0), BIAS: at(12)}).classes == ((BIAS, DRIFT),)  # cos^2 = 0.957
+    assert limits({DRIFT: at(0), BIAS: at(14)}).classes == ()  # cos^2 = 0.941
 
 
 def test_the_part_that_the_matrix_absorbs_does_not_count_as_alike() -> None:
-    assert detectability({DRIFT: 5 * MATRIX + FIRST, BIAS: 5 * MATRIX + SECOND}).classes == ()
+    assert limits({DRIFT: 5 * MATRIX + FIRST, BIAS: 5 * MATRIX + SECOND}).classes == ()
 
 
 def test_pairs_that_share_an_effect_are_one_class() -> None:
-    found = detectability({DRIFT: at(0), BIAS: at(12), FLOOR: at(24)})
+    found = limits({DRIFT: at(0), BIAS: at(12), FLOOR: at(24)})
     assert found.classes == ((BIAS, FLOOR, DRIFT),)
 
 
 def test_an_effect_that_two_others_make_together_is_said_with_their_names() -> None:
-    found = detectability({DRIFT: at(45), BIAS: FIRST, FLOOR: SECOND, LATENCY: THIRD})
+    found = limits({DRIFT: at(45), BIAS: FIRST, FLOOR: SECOND, LATENCY: THIRD})
     assert found.classes == ()
     imitated = dict(found.sums)
     assert set(imitated) == {DRIFT, BIAS, FLOOR}  # each of the three is made by the other two
@@ -220,27 +235,31 @@ def test_an_effect_that_two_others_make_together_is_said_with_their_names() -> N
 
 
 def test_a_size_hides_within_its_interval_and_is_found_from_a_few_standard_errors_on() -> None:
-    (hidden,) = detectability({DRIFT: 4 * FIRST}).hidden  # an information of 16: a standard error of 1/4
-    assert hidden.limit == pytest.approx(1.96 / 4)
-    assert hidden.detectable == pytest.approx(5.5 / 4)
-    assert hidden.plausible == 0.1
+    (size,) = hidden({DRIFT: 4 * FIRST})  # an information of 16: a standard error of 1/4
+    assert size.limit == pytest.approx(1.96 / 4)
+    assert size.detectable == pytest.approx(5.5 / 4)
+    assert size.plausible == 0.1
 
 
 def test_an_effect_that_was_found_hides_no_longer() -> None:
-    found = detectability({DRIFT: FIRST, BIAS: SECOND}, (0, 20, 0, 0, 0))
-    assert [each.name for each in found.hidden] == [BIAS]
+    assert [each.name for each in hidden({DRIFT: FIRST, BIAS: SECOND}, (0, 20, 0, 0, 0))] == [BIAS]
+
+
+Dependences = tuple[list[CovariateDependence], list[CovariateDependence]]
 
 
 def dependences(gains: Sequence[float], named: dict[str, np.ndarray], covariates: Sequence[str] = ()) -> Dependences:
-    """Dependences of residuals. covariates: of the bases in turn, by default their names."""
+    """What residuals depend on, before and after effects. covariates: of the bases, by default their names."""
     given = screening(named, {"heading": FIRST, "place": SECOND, "elapsed time": THIRD}, gains)
     bases = tuple(replace(base, name=name) for base, name in zip(given.groups.bases, covariates, strict=False))
     given = replace(given, groups=replace(given.groups, bases=bases or given.groups.bases))
-    return covariate_dependences(given, selected(given), None)
+    where = significance_of(given.data, given.groups.matrix.index, given.groups.bases, np.random.default_rng(0))
+    return dependences_on(where), dependences_on(selected(given).left, "still ")
 
 
 def covariates(given: Dependences) -> tuple[list[str], list[str]]:
-    return [each.covariate for each in given.where], [each.covariate for each in given.left]
+    where, left = given
+    return [each.covariate for each in where], [each.covariate for each in left]
 
 
 def test_the_surest_covariate_comes_first_and_chance_is_not_mentioned() -> None:
@@ -252,7 +271,7 @@ def test_what_a_named_effect_explains_is_no_longer_left() -> None:
 
 
 def test_of_several_bases_of_a_covariate_the_surest_stands_for_it() -> None:
-    (place,) = dependences([0, 8, 20, 0, 0], {}, ["place", "place", "elapsed time"]).where
+    (place,) = dependences([0, 8, 20, 0, 0], {}, ["place", "place", "elapsed time"])[0]
     assert place.description == "the residual depends on the place"
     assert place.excess == pytest.approx(399)
     assert place.degrees_of_freedom == 1
@@ -260,9 +279,7 @@ def test_of_several_bases_of_a_covariate_the_surest_stands_for_it() -> None:
 
 def test_of_two_families_the_one_that_is_no_chance_stands_for_their_covariate() -> None:
     calm, rough = family("a line", 4.0, 4, np.linspace(0, 1, 499)), family("tiles", 5.0, 140, np.linspace(0, 9, 499))
-    given = screening({}, {"place": FIRST}, [0, 0, 0, 0, 0])
-    selection = replace(selected(given), where=together(rough, calm))
-    (place,) = covariate_dependences(given, selection, None).where
+    (place,) = dependences_on(together(rough, calm))
     assert place.description == "the residual depends on a line"
 
 
@@ -300,7 +317,7 @@ def test_wheels_with_gaussian_noise_have_no_ticks() -> None:
     rng = np.random.default_rng(5)
     for speed in (0.005, 0.03, 0.1):
         angles = speed * np.array([1.0, -0.3, 0.5]) + 3e-4 * rng.standard_normal((800, 3))
-        assert not model_selection.quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)]).any()
+        assert not quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)]).any()
 
 
 @pytest.mark.parametrize("tick", [1e-4, 1e-3])
@@ -308,7 +325,7 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
     rng = np.random.default_rng(6)
     counts = np.floor(np.cumsum(0.03 + 3e-4 * rng.standard_normal((800, 3)), axis=0) / tick)
     angles = tick * np.diff(counts, axis=0, prepend=0.0)
-    steps = model_selection.quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
+    steps = quantisation_steps([turning(np.round(angles / 0.02, 6) * 0.02)])
     assert steps == pytest.approx(tick, rel=1e-3)
 
 
@@ -316,13 +333,13 @@ def test_ticks_are_found_in_wheel_rates_that_are_written_with_six_digits(tick: f
 def test_the_size_of_a_tick_is_found(tick: float, seed: int, most: int) -> None:
     counts = np.random.default_rng(seed).integers(-most, most + 1, size=(400, 3))
     counts[:2] = [[most] * 3, [most - 1] * 3]
-    np.testing.assert_allclose(model_selection.quantisation_steps([turning(tick * counts)]), tick, rtol=1e-9)
+    np.testing.assert_allclose(quantisation_steps([turning(tick * counts)]), tick, rtol=1e-9)
 
 
 def bound(commands: Sequence[str], columns: Sequence[np.ndarray], beyond: Sequence[int] = ()) -> float:
     runs = [run_of(FORWARD, command, f"run {number}") for number, command in enumerate(commands)]
     fit = extended_of(runs, [np.zeros((2, 3)) for _ in runs]).fit
-    return model_selection.EncoderQuantisation(fit, fit.whitened(columns)).chi_square([0], beyond)
+    return EncoderQuantisation(fit, fit.whitened(columns)).chi_square([0], beyond)
 
 
 def test_a_column_explains_at_most_the_quarter_ticks_that_all_push_along_it() -> None:
@@ -356,25 +373,25 @@ def significance(left: float, rank: int = 1) -> Significance:
 
 def test_the_evidence_of_a_difference_is_that_of_the_likeliest_g_prior() -> None:
     # (10 - 2 - 2 ln 5) / 2
-    assert log_evidence(np.array([10.0]), np.array([2]), 0.0)[0] == pytest.approx(2.390562)
+    assert log_evidence(np.array([10.0]), np.array([2]))[0] == pytest.approx(2.390562)
     ratios = [(1 + g) ** -1 * np.exp(10 / 2 * g / (1 + g)) for g in np.linspace(0, 20, 20_001)]
-    assert log_evidence(np.array([10.0]), np.array([2]), 0.0)[0] == pytest.approx(np.log(max(ratios)), abs=1e-6)
+    assert log_evidence(np.array([10.0]), np.array([2]))[0] == pytest.approx(np.log(max(ratios)), abs=1e-6)
 
 
 def test_a_difference_no_larger_than_chance_makes_counts_against_its_columns() -> None:
-    at_chance, below = log_evidence(np.array([3.0, 1.0]), np.array([3, 3]), 0.0)
+    at_chance, below = log_evidence(np.array([3.0, 1.0]), np.array([3, 3]))
     assert at_chance == 0.0
     assert below == -1.0
 
 
 def test_beside_an_effect_ten_percent_off_its_form_differences_count_as_much_less_as_their_variance_is_larger() -> None:
     # 1 + 0.1^2 * 300 = 4: a difference of 40 counts as one of 10
-    assert log_evidence(np.array([40.0]), np.array([2]), 300.0)[0] == pytest.approx(2.390562)
+    assert tempered_evidence(np.array([40.0]), np.array([2]), 300.0)[0] == pytest.approx(2.390562)
 
 
 def test_sets_are_all_of_different_effects_up_to_a_size_with_their_prior_odds() -> None:
     given = screening({DRIFT: FIRST, BIAS: SECOND}, PLACE, [0, 3, 4, 0, 0], tries={BIAS: 2})
-    sets = effect_sets(given.beyond_matrix(), given.groups.effects, 2)
+    sets = effect_sets(given.beyond_matrix, given.groups.effects, 2)
     assert [tuple(group.name for group in each) for each in sets.sets] == [(), (DRIFT,), (BIAS,), (DRIFT, BIAS)]
     assert sets.energy == pytest.approx(9 + 16 - 2)
     trusted = np.array([0.0, 9.0, 16.0, 25.0]) / (1 + 0.01 * 23)
@@ -387,7 +404,7 @@ def test_sets_are_all_of_different_effects_up_to_a_size_with_their_prior_odds() 
 def test_two_shapes_of_an_effect_are_never_in_one_set() -> None:
     given = screening({DRIFT: FIRST, BIAS: SECOND}, PLACE, [0, 3, 4, 0, 0])
     pool = [given.groups.effects[0], Group("effect", DRIFT, (2,), parameters=(POSITIVE,))]
-    assert max(len(each) for each in effect_sets(given.beyond_matrix(), pool, 2).sets) == 1
+    assert max(len(each) for each in effect_sets(given.beyond_matrix, pool, 2).sets) == 1
 
 
 def test_where_little_noise_blurs_what_is_left_the_bayes_factor_is_the_ratio_of_the_densities_of_its_share() -> None:
@@ -419,7 +436,7 @@ def credibility(
 ) -> Credibility:
     """Credibility of the first ``count`` of two effects beside a basis of one function."""
     given = screening({DRIFT: FIRST, BIAS: second}, {"place": function}, gains, parameter=parameter)
-    start, chosen = given.beyond_matrix(), given.groups.effects[:count]
+    start, chosen = given.beyond_matrix, given.groups.effects[:count]
     return credibility_of(effect_sets(start, chosen, count), start, chosen, significance(left), significance(beyond))
 
 
@@ -460,7 +477,7 @@ def test_effects_that_cancel_each_other_have_even_odds_at_most() -> None:
     # Columns 25 degrees apart, and residuals along their difference: together 1 of what they make alone is left.
     close = np.cos(np.radians(25)) * FIRST + np.sin(np.radians(25)) * SECOND
     given = screening({DRIFT: FIRST, BIAS: close}, PLACE, [0, 0, 20, 0, 0])
-    start = given.beyond_matrix()
+    start = given.beyond_matrix
     values, _ = start.estimate([1, 2])
     joint = start.chi_square([1, 2]) / float(np.square(values).sum())
     assert joint == pytest.approx(1 / (1 / np.tan(np.radians(25)) ** 2 + 1 / np.sin(np.radians(25)) ** 2))
@@ -525,10 +542,10 @@ def bare(grooved: tuple[Dataset, Truth, Discovery]) -> Extended:
 
 
 @pytest.fixture(scope="module")
-def screened_again(bare: Extended) -> tuple[model_selection.Screening, model_selection.Selection]:
+def screened_again(bare: Extended) -> tuple[Screening, Selection]:
     """Their screening, and what is selected after it."""
-    screening = model_selection.screen_plain(bare.fit, ())
-    return screening, model_selection.select_effects(screening, np.random.default_rng(0))
+    screening = screened_plain(bare.fit)
+    return screening, select_effects(screening, np.random.default_rng(0))
 
 
 def error(calibration: Calibration, dataset: Dataset, truth: Truth, found: Discovery) -> float:
@@ -573,15 +590,15 @@ def test_no_term_is_tried_where_it_is_not_wanted_or_nothing_is_missing(make: Cal
 
 
 def test_functions_are_fitted_together_with_named_effects_and_stand_after_them(
-    bare: Extended, screened_again: tuple[model_selection.Screening, model_selection.Selection]
+    bare: Extended, screened_again: tuple[Screening, Selection]
 ) -> None:
     screening, selection = screened_again
-    models = with_names(bare, selection, group("heading_drift"))
-    smooth = add_smooth_terms(bare.fit, screening, models, selection.where, lambda _: selection.left, FOLDS)
-    used = smooth.models.used
+    named = extend(bare.fit, [group("heading_drift")])
+    smooth = add_smooth_terms(bare.fit, screening, named, selection.left, lambda _: selection.left, FOLDS)
+    used = smooth.model
     assert used.groups[0].name == "heading_drift"
     assert {each.name for each in used.groups[1:]} <= {"smooth_heading", "smooth_course", "smooth_heading_wave"}
-    assert smooth.models.weighted[0][1] is used
+    assert used.groups[1:] == smooth.terms
     assert "unnamed" in smooth.notes[0]
     calibrated = {term.name: term.values for term in used.fit.model.terms}
     assert calibrated["heading_drift"]["b"] == used.values[0]
@@ -599,12 +616,13 @@ def test_runs_of_few_kinds_of_motion_get_no_term(grooved: tuple[Dataset, Truth, 
 
 
 def test_nothing_is_added_to_a_model_that_leaves_nothing_of_it(
-    bare: Extended, screened_again: tuple[model_selection.Screening, model_selection.Selection]
+    bare: Extended, screened_again: tuple[Screening, Selection]
 ) -> None:
     screening, selection = screened_again
-    models = with_names(bare, selection, group("smooth_heading"), group("smooth_course"))
-    smooth = add_smooth_terms(bare.fit, screening, models, selection.where, lambda _: selection.left, FOLDS)
-    assert smooth.models is models
+    model = extend(bare.fit, [group("smooth_heading"), group("smooth_course")])
+    smooth = add_smooth_terms(bare.fit, screening, model, selection.left, lambda _: selection.left, FOLDS)
+    assert smooth.model is model
+    assert smooth.terms == ()
     assert "unnamed term" in smooth.notes[0]
     assert "was added" in smooth.notes[0] or "left out" in smooth.notes[0]
 
@@ -618,12 +636,6 @@ def test_named_effects_come_one_by_one_and_what_has_no_name_at_once() -> None:
     assert step_name(nameless) == "unnamed, over place"
 
 
-def with_names(bare: Extended, selection: model_selection.Selection, *groups: Group) -> CompetingModels:
-    """A model with these effects, whatever was selected."""
-    used = extend(bare.fit, groups)
-    return CompetingModels(used, selection, ((1.0, used),), ())
-
-
 def group(name: str, **shapes: float) -> Group:
     effect = effects.create(name)
     parameters = effect.parameters(ROBOT)
@@ -634,7 +646,7 @@ def group(name: str, **shapes: float) -> Group:
 
 # Models that recordings cannot tell apart: which is used, and their average with its weights and how unsure it is.
 
-Fitted = tuple[Fit, model_selection.Selection, dict[str, Group]]
+Fitted = tuple[Fit, Selection, dict[str, Group]]
 RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 
 
@@ -642,10 +654,10 @@ RIGHT, WRONG = "rotation_translation_coupling", "acceleration_slip"
 def fitted() -> Fitted:
     """The plain fit, the selection of the one effect that is there, and all effects."""
     plain = plain_fit(simulated(COUPLING, validation=None))
-    screening = model_selection.screen_plain(plain, ())
+    screening = screened_plain(plain)
     return (
         plain,
-        model_selection.select_effects(screening, np.random.default_rng(0)),
+        select_effects(screening, np.random.default_rng(0)),
         {g.name: g for g in screening.groups.effects},
     )
 
@@ -754,8 +766,15 @@ def runs(name: str = "motor_gain", count: int = 12, **values: float) -> list[Tra
     return made
 
 
-def found(recorded: list[Trajectory], *without: str) -> model_selection.MotorEffects | None:
-    return model_selection.select_motor_effects(recorded, APR, without, np.random.default_rng(0))
+Motors = tuple[Selection, np.ndarray, EstimatedCovariance]
+
+
+def found(recorded: list[Trajectory], *without: str) -> Motors:
+    """What was selected, with its values and their covariance."""
+    screened = screen_motors(recorded, APR, without)
+    assert screened is not None
+    selection = select_effects(screened.screening, np.random.default_rng(0))
+    return selection, *fit_motors(screened, selection.chosen)
 
 
 @pytest.mark.parametrize(
@@ -763,36 +782,36 @@ def found(recorded: list[Trajectory], *without: str) -> model_selection.MotorEff
     [("motor_gain", {"g": -0.03}), ("motor_lag", {"tau": 0.08}), ("motor_dead_band", {"band": 0.05})],
 )
 def test_an_effect_is_named_and_its_parameter_exact_to_its_standard_error(name: str, values: dict[str, float]) -> None:
-    motors = found(runs(name, **values))
-    assert [group.name for group in motors.selection.chosen] == [name]
-    error = motors.covariance.standard_deviations[0]
-    assert motors.values[0] == pytest.approx(*values.values(), abs=4 * error)
+    selection, parameters, covariance = found(runs(name, **values))
+    assert [group.name for group in selection.chosen] == [name]
+    error = covariance.standard_deviations[0]
+    assert parameters[0] == pytest.approx(*values.values(), abs=4 * error)
     assert error < 0.02 * abs(next(iter(values.values())))
 
 
 def test_the_standard_error_of_a_gain_is_that_of_a_regression_on_the_targets() -> None:
     recorded = runs(g=-0.03, count=60)
-    motors = found(recorded)
+    _, _, covariance = found(recorded)
     squares = sum(float(np.square(run.targets).sum()) for run in recorded if run.targets is not None)
-    assert motors.covariance.standard_deviations[0] == pytest.approx(NOISE / np.sqrt(squares), rel=0.5)
+    assert covariance.standard_deviations[0] == pytest.approx(NOISE / np.sqrt(squares), rel=0.5)
 
 
 def test_of_motors_that_only_scatter_nothing_is_named() -> None:
-    motors = found(runs(g=0.0))
-    assert motors.selection.chosen == ()
-    assert motors.values.shape == (0,)
+    selection, parameters, _ = found(runs(g=0.0))
+    assert selection.chosen == ()
+    assert parameters.shape == (0,)
 
 
 def test_an_effect_that_is_left_out_is_not_named() -> None:
-    motors = found(runs(g=-0.03), "motor_gain")
-    assert "motor_gain" not in motors.selection.weights
+    selection, _, _ = found(runs(g=-0.03), "motor_gain")
+    assert "motor_gain" not in selection.weights
 
 
 def test_without_targets_there_is_nothing_to_say() -> None:
-    assert found([replace(run, targets=None) for run in runs(g=-0.03)]) is None
+    assert screen_motors([replace(run, targets=None) for run in runs(g=-0.03)], APR, ()) is None
 
 
 def test_targets_that_are_copies_of_the_rates_or_were_never_filled_say_nothing() -> None:
     recorded = runs(g=-0.03)
-    assert found([replace(run, targets=run.rates) for run in recorded]) is None
-    assert found([replace(run, targets=np.zeros_like(run.rates)) for run in recorded]) is None
+    assert screen_motors([replace(run, targets=run.rates) for run in recorded], APR, ()) is None
+    assert screen_motors([replace(run, targets=np.zeros_like(run.rates)) for run in recorded], APR, ()) is None

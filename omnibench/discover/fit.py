@@ -1,4 +1,4 @@
-"""Fits of a discovery: the plain matrix, and matrix and effects, with the noise and the nuisances that they leave.
+"""Step 1, fit: the plain matrix with the noise that it leaves; and the fits of matrix and effects of later steps.
 
 Long drives are cut into windows that serve as runs, each from its own reference pose. Outliers are reference poses that
 contradict the other poses of their run, where nothing like it recurs. Let r be the residuals of a run along one axis,
@@ -23,14 +23,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from omnibench.data.dataset import Trajectory
-from omnibench.discover.regressors.paths import Paths, blocks_of, make_paths, slopes_by
-from omnibench.discover.regressors.significance import Group
+from omnibench.data.dataset import Dataset, Trajectory
+from omnibench.discover.paths import Paths, blocks_of, make_paths, slopes_by
+from omnibench.discover.significance import Group
+from omnibench.errors import DataError
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
 from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.motion_windows import windows_of
-from omnibench.robot.calibration import Noise
+from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.model import OdometryModel
@@ -51,6 +52,42 @@ def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
         return tuple(runs)
     length = max(_SHORTEST, sum(run.end for run in runs) / _MOST)
     return tuple(window for run in runs for window in windows_of(run, max(1, int(run.end / length))))
+
+
+@dataclass(frozen=True, eq=False)
+class PlainFit:
+    """The plain matrix, fitted to the training runs of a data set.
+
+    fit: the matrix at the runs, or at their windows, with the noise that it leaves.
+    """
+
+    dataset: Dataset
+    fit: Fit
+
+
+def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> PlainFit:
+    """Fit the plain matrix from the design, or from a calibration's matrix without effects.
+
+    Where no training run repeats a command, runs of the validation split that do tell the noise. DataError: there are
+    no reference poses, or the calibration is of another robot or holds effects whose plain matrix is not known.
+    """
+    start = dataset.robot.inverse_kinematic_matrix
+    if calibration is not None:
+        if calibration.effects and calibration.plain is None:
+            names = ", ".join(term.name for term in calibration.effects)
+            raise DataError(
+                f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
+                "matrix; give one without effects, such as the plain.yaml beside it, or none"
+            )
+        calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
+        start = calibration.matrix_without_effects
+    recorded = dataset.split("train")
+    runs = fits.usable_runs(in_windows([run for run in recorded if run.has_poses]) or recorded)
+    try:
+        repeating = fits.usable_runs(reference_noise.repeating_runs(runs, dataset.split("validation")), "validation")
+    except DataError:
+        repeating = ()
+    return PlainFit(dataset, fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating))
 
 
 _UNKNOWN_NOISE = reference_noise.NoiseEstimate(reference_noise.FIRST_NOISE, "within runs", 1, "")

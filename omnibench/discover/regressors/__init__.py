@@ -1,1 +1,0 @@
-"""Regressors: columns by which the residuals may depend on something, and their significance."""
