@@ -37,7 +37,7 @@ def conclude(confirmed: Confirmed, choices: Mapping[str, Any]) -> result.Discove
     """Judge plain and extended model on held-out runs, and say what was found. choices: options and seed."""
     selected, screening, models = confirmed.selected, confirmed.screening, confirmed.models
     proposal, selection = selected.proposal, models.selection
-    plain, dataset = proposal.located.plain.fit, proposal.located.plain.dataset
+    dataset = proposal.located.plain.dataset
     baseline, extended, folds = confirmed.baseline, confirmed.extended, confirmed.folds
     fit, effects, where, left = extended.fit, confirmed.effects, confirmed.where, confirmed.left
 
@@ -83,7 +83,7 @@ def conclude(confirmed: Confirmed, choices: Mapping[str, Any]) -> result.Discove
         hidden=hidden_sizes(screening, selection.chosen, confusable, spread),
         gap=held_out[0 if needs_session else -1].eq6 if held_out else validating.training_gap(baseline, extended),
         held_out=held_out,
-        steps=validating.waterfall_steps(plain, baseline, models.used, extended, validation),
+        steps=validating.waterfall_steps(baseline, confirmed.likeliest, extended, validation),
         extrapolations=validating.extrapolations_of(validation.runs, baseline, extended, confirmed.average.members),
         experiments=experiments_for(dataset, effects, models.weighted),
         notes=(*notes, *validation.warnings),

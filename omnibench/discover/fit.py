@@ -16,7 +16,7 @@ The covariance of matrix elements and parameters is that of the noise, or of the
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,8 +29,18 @@ from omnibench.discover.significance import Group
 from omnibench.errors import DataError
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
+from omnibench.fit.estimate import (
+    LOST_RATE,
+    USUAL_NUISANCES,
+    EstimateProblem,
+    Linearisation,
+    Nuisances,
+    Unknown,
+    estimate,
+)
 from omnibench.fit.intervals import Clusters, jackknife
 from omnibench.fit.motion_windows import windows_of
+from omnibench.fit.prior import physical_prior_root, physical_tolerance
 from omnibench.robot.calibration import Calibration, Noise
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term
 from omnibench.robot.kinematics import Array, Robot
@@ -394,6 +404,9 @@ _NEAR = 0.02  # share of the largest component of the noise by which two noises 
 _STEPS = 4  # Gauss-Newton steps, at most
 _HALVINGS = 10  # tries of a step that leads too far, each half of the one before: at last 1 / 512 of it
 _ROUNDING = 1e-6  # share of chi-square by which a step of an ended fit may raise it, as numbers are rounded
+# rad by which an estimate turns headings against its linearisation: below the first it is the model itself, to 1e-6 of
+# a path's length; above the second slopes are taken anew (chosen).
+_STRAIGHT, _BENT = 1e-3, 0.02
 _STILL = 0.05  # standard errors: a smaller step, which no interval shows, ends the fit
 
 
@@ -403,7 +416,7 @@ class Extended:
 
     data: whitened columns of the matrix elements, then of the effects' linear parameters. columns (K, 3, p): each run's
     columns, before whitening. values (n,): the effects' linear parameters. covariance (p, p): of matrix elements and
-    parameters.
+    parameters. without_folds: how they change without some runs, where they are not those of least squares.
     """
 
     fit: Fit
@@ -412,6 +425,16 @@ class Extended:
     columns: tuple[Array, ...]
     values: Array
     covariance: EstimatedCovariance
+    without_folds: Callable[[NDArray[np.intp]], Array] | None = None
+
+    def steps_without(self, folds: NDArray[np.intp]) -> Array:
+        """Changes (Z, p) of matrix elements and parameters for each run, once all runs of its fold (Z,) are left out.
+
+        They are to first order: least squares of the other runs, unless ``without_folds`` says otherwise.
+        """
+        if self.without_folds is not None:
+            return self.without_folds(folds)
+        return values_of_other_folds(self.data, range(len(self.data.information)), folds)
 
     @property
     def residuals_without_effects(self) -> list[Array]:
@@ -489,6 +512,59 @@ def without_effects(plain: Fit, extended: Extended) -> Extended:
     return extend(at_model(extended.fit, plain.model), ()) if extended.groups else extended
 
 
+def most_probable(fit: Fit, groups: Sequence[Group], values: Array) -> Extended:
+    """Matrix and effects as ``calibrate`` estimates a matrix: weighed by what is known of the design, and robust.
+
+    The estimate is that of fit/estimate.py, whose prior for a parameter is its largest plausible size, and for the lost
+    rate that of the robot's class. Runs count as they are; outliers, by the loss. values (n,): of the effects'
+    parameters, to begin with.
+    """
+    robot, elements = fit.model.robot, fit.model.matrix.size
+    tolerance = physical_tolerance(robot)
+    parameters = [(group.name, parameter) for group in groups for parameter in group.parameters]
+    unknowns = tuple(
+        Unknown(name, each.name, tolerance.lost_rate if (name, each.name) == LOST_RATE else each.largest)
+        for name, each in parameters
+    )
+    root, period = physical_prior_root(robot, tolerance), fit.model.sample_period
+    assert period is not None
+    problem = EstimateProblem(
+        robot, fit.runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES)
+    )
+    still = replace(fit, nuisances=fits.Nuisances(np.zeros_like(fit.nuisances.values), fit.nuisances.deviations))
+    now, found, columns = np.append(fit.model.matrix, values), None, None
+    for _ in range(_ROUNDS):
+        model = model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:]))
+        still = still.changed(model=model)
+        if columns is None:
+            columns = columns_of(still, groups)
+        errors = [-residuals for residuals in still.residuals]
+        found = estimate(problem, near=found, about=Linearisation(now, errors, columns, still.slopes))
+        step, now = found.values - now, found.values
+        turned = max(float(np.abs(of_run[:, 2] @ step).max()) for of_run in columns)
+        if turned < _STRAIGHT:
+            break
+        columns = None if turned > _BENT else columns
+    assert found is not None
+    estimated, whole = found, found.information.sum(axis=0) + np.eye(found.root.shape[1])
+
+    def without_folds(folds: NDArray[np.intp]) -> Array:
+        """One Gauss-Newton step of the estimate without the runs of each fold."""
+        steps = np.zeros((len(folds), len(now)))
+        for fold in np.unique(folds):
+            inside = folds == fold
+            others = whole - estimated.information[inside].sum(axis=0)
+            steps[inside] = estimated.root @ np.linalg.solve(others, estimated.scores[inside].sum(axis=0))
+        return steps
+
+    there = at_model(fit, model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:])))
+    columns = columns_of(there, groups) if columns is None else columns
+    clusters, unit = Clusters.of(fit.runs), np.eye(found.root.shape[1])
+    covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
+    data = there.whitened(columns)
+    return Extended(there, tuple(groups), data, columns, now[elements:], covariance, without_folds)
+
+
 def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:
     """The effects as terms of a model. values: all their linear parameters in turn."""
     terms, first = [], 0
@@ -558,3 +634,19 @@ def _bends(groups: Sequence[Group]) -> bool:
 
 def _chi_square(data: fits.Whitened) -> float:
     return sum(float(np.square(of_run).sum()) for of_run in data.residuals)
+
+
+def without_runs(data: fits.Whitened, held_out: NDArray[np.bool_]) -> fits.Given:
+    """The columns over all runs but those (Z,) that are held out."""
+    columns = np.concatenate([data.columns[run] for run in np.flatnonzero(held_out).tolist()])
+    return fits.Given(data.information - columns.T @ columns, data.scores[~held_out], np.diag(data.information))
+
+
+def values_of_other_folds(data: fits.Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
+    """Values (Z, n) of the columns ``index``: for each run, those fitted to the runs of all folds but its own."""
+    index = list(index)
+    few = data.only(index)
+    values = np.zeros((len(folds), len(index)))
+    for fold in np.unique(folds):
+        values[folds == fold] = without_runs(few, folds == fold).estimate(range(len(index)))[0]  # Eq. (1)
+    return values

@@ -50,7 +50,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.fit import Extended, Fit, at_runs, columns_at, extend, inliers_of, model_with
+from omnibench.discover.fit import (
+    Extended,
+    Fit,
+    at_runs,
+    columns_at,
+    inliers_of,
+    model_with,
+    most_probable,
+    values_of_other_folds,
+)
 from omnibench.discover.result import Extrapolation, Gap, HeldOut, Step
 from omnibench.discover.significance import Group
 from omnibench.errors import DataError
@@ -58,7 +67,6 @@ from omnibench.fit.evaluate import final_errors
 from omnibench.fit.noise import grouped, repeating_runs, whiteners
 from omnibench.fit.sessions import SessionComparison, compare_sessions, sessions_of
 from omnibench.fit.trajectory_fit import (
-    Given,
     Whitened,
     differences_without_nuisances,
     in_start_frames,
@@ -231,28 +239,12 @@ def folds_of_kinds(fit: Fit) -> NDArray[np.intp]:
     return kinds_of_runs(fit) % _FOLDS
 
 
-def without_runs(data: Whitened, held_out: NDArray[np.bool_]) -> Given:
-    """The columns over all runs but those (Z,) that are held out."""
-    columns = np.concatenate([data.columns[run] for run in np.flatnonzero(held_out).tolist()])
-    return Given(data.information - columns.T @ columns, data.scores[~held_out], np.diag(data.information))
-
-
-def values_of_other_folds(data: Whitened, index: Sequence[int], folds: NDArray[np.intp]) -> Array:
-    """Values (Z, n) of the columns ``index``: for each run, those fitted to the runs of all folds but its own."""
-    index = list(index)
-    few = data.only(index)
-    values = np.zeros((len(folds), len(index)))
-    for fold in np.unique(folds):
-        values[folds == fold] = without_runs(few, folds == fold).estimate(range(len(index)))[0]  # Eq. (1)
-    return values
-
-
 def held_out_residuals(extended: Extended, folds: NDArray[np.intp]) -> list[Array]:
     """Residuals (k, 3) of each run's inliers, to first order, by the model fitted to all folds but the run's own.
 
     Nothing is fitted to the run itself, nor are its nuisances.
     """
-    left = left_by(extended, values_of_other_folds(extended.data, range(len(extended.data.information)), folds))
+    left = left_by(extended, extended.steps_without(folds))
     return [residuals[inliers] for residuals, inliers in zip(left, extended.fit.masks, strict=True)]
 
 
@@ -340,10 +332,9 @@ class Errors:
 
 def errors_of_repetitions(extended: Extended, folds: NDArray[np.intp]) -> Errors:
     """Errors on the runs of the fit, each predicted from the other folds."""
-    every = range(len(extended.data.information))
-    values = values_of_other_folds(extended.data, every, folds)
-    finals = np.array([residuals[-1] for residuals in left_by(extended, values)])
-    squares = squares_left_by(extended.data, every, values)
+    steps = extended.steps_without(folds)
+    finals = np.array([residuals[-1] for residuals in left_by(extended, steps)])
+    squares = squares_left_by(extended.data, range(steps.shape[1]), steps)
     return Errors(finals, squares / [len(residuals) for residuals in extended.data.residuals])
 
 
@@ -413,17 +404,21 @@ def gap_between(metric: Literal["eq6", "chi2"], before: Array, after: Array, flo
 
 
 def waterfall_steps(
-    plain: Fit, baseline: Extended, used: Extended, extended: Extended, validation: ValidationRuns
+    baseline: Extended, likeliest: Extended, extended: Extended, validation: ValidationRuns
 ) -> tuple[Step, ...]:
     """The plain matrix (baseline), then the models with one effect more each; all under the extended model's noise.
 
-    used: the model with the effects that are named, one after another. extended: the last model, which may be the
-    average of that one and others. plain: the fit that models between the first and the last are extended from.
+    likeliest: the model whose effects are added one after another. extended: the last model, which may be the average
+    of that one and others.
     """
     models = [("plain matrix", baseline)]
-    for count in group_counts(used.groups):
-        model = extended if count == len(used.groups) else extend(plain, used.groups[:count])
-        models.append((f"+ {step_name(used.groups[count - 1])}", model))
+    for count in group_counts(likeliest.groups) if extended.groups else ():
+        model, groups = extended, likeliest.groups[:count]
+        if count < len(likeliest.groups):
+            model = most_probable(
+                baseline.fit, groups, likeliest.values[: sum(len(group.parameters) for group in groups)]
+            )
+        models.append((f"+ {step_name(groups[-1])}", model))
     return tuple(_step(name, model.fit, extended.fit, validation) for name, model in models)
 
 

@@ -357,7 +357,7 @@ class Discovery(Shown):
     @property
     def extends(self) -> bool:
         """True if the extended model holds more than the plain matrix."""
-        return len(self.steps) > 1
+        return bool(self.extended.effects)
 
     @property
     def has_other_session(self) -> bool:

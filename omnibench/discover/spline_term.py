@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.discover.covariates import Basis
-from omnibench.discover.fit import Extended, Fit, columns_of, extend
-from omnibench.discover.held_out import folds_of_kinds, is_gain, without_runs
+from omnibench.discover.fit import Extended, Fit, columns_of, extend, without_runs
+from omnibench.discover.held_out import folds_of_kinds, is_gain
 from omnibench.discover.locate import weights_of_covariates
 from omnibench.discover.result import CHANCE
 from omnibench.discover.screening import Screening

@@ -104,7 +104,7 @@ class Estimate:
     matrix (3, M), m and rad per rad. terms: effects beside it. unknowns (k,): as in Eq. (1). root (3M + p, k):
     derivatives of the matrix elements, row by row, and of the p parameters of the effects by these. information
     (Z, k, k) and scores (Z, k): Hessian and slope of half of each run's part of Eq. (3) at the minimum. excess: w of
-    Eq. (4) by the kind of error, m or rad.
+    Eq. (4) by the kind of error, m or rad. values (3M + p,): matrix elements, row by row, and parameters.
     """
 
     matrix: Array
@@ -116,6 +116,7 @@ class Estimate:
     excess: dict[str, float]
     steps: int
     at_rest: bool
+    values: Array
 
     @property
     def error(self) -> float:
@@ -149,15 +150,36 @@ class EstimateProblem:
         """Number of matrix elements and parameters of effects."""
         return len(self.root) + len(self.unknowns)
 
+    def values(self, unknowns: Array) -> Array:
+        """The matrix elements, row by row, and the parameters of effects of unknowns (k,), Eq. (1)."""
+        count = self.root.shape[1]
+        elements = self.robot.inverse_kinematic_matrix.ravel() + self.root @ unknowns[:count]
+        shares = zip(self.unknowns, unknowns[count:].tolist(), strict=False)
+        return np.append(elements, [unknown.middle + share * unknown.deviation for unknown, share in shares])
+
     def answer(self, unknowns: Array) -> tuple[Array, tuple[Term, ...]]:
-        """The matrix (3, M) and the effects of unknowns (k,), Eq. (1)."""
-        design, count = self.robot.inverse_kinematic_matrix, self.root.shape[1]
+        """The matrix (3, M) and the effects of unknowns (k,)."""
+        values = self.values(unknowns)
         by_effect: dict[str, dict[str, float]] = {}
-        for unknown, share in zip(self.unknowns, unknowns[count:].tolist(), strict=False):
-            value = unknown.middle + share * unknown.deviation
+        for unknown, value in zip(self.unknowns, values[len(self.root) :].tolist(), strict=True):
             by_effect.setdefault(unknown.effect, {})[unknown.parameter] = value
         terms = tuple(make_term(name, parameters, self.robot) for name, parameters in by_effect.items())
-        return design + (self.root @ unknowns[:count]).reshape(design.shape), terms
+        return values[: len(self.root)].reshape(self.robot.inverse_kinematic_matrix.shape), terms
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """A model at the runs of a problem, in whose place its slopes stand near it.
+
+    values (3M + p,): the matrix elements, row by row, and the parameters of effects. errors (K, 3), columns
+    (K, 3, 3M + p) and drifts (K, 3, 3) of each run: predicted less observed poses after the start, and their
+    derivatives by the values and by the run's nuisances.
+    """
+
+    values: Array
+    errors: Sequence[Array]
+    columns: Sequence[Array]
+    drifts: Sequence[Array]
 
 
 def usual_problem(robot: Robot, runs: Sequence[Trajectory], integration: Integration = "arc") -> EstimateProblem:
@@ -199,14 +221,18 @@ def estimate_with_steering(problem: EstimateProblem, may_go_on: Callable[[int], 
 
 
 def estimate(
-    problem: EstimateProblem, may_go_on: Callable[[int], bool] = lambda _: True, near: Estimate | None = None
+    problem: EstimateProblem,
+    may_go_on: Callable[[int], bool] = lambda _: True,
+    near: Estimate | None = None,
+    about: Linearisation | None = None,
 ) -> Estimate:
     """The minimum of Eq. (3) by Gauss-Newton steps. DataError: no run has a reference after its start.
 
     may_go_on: asked before each step but the first, with the number of those that were made. near: where the steps
-    begin, in the place of the design.
+    begin, in the place of the design. about: a linearisation that stands for the model, whose terms are the caller's;
+    then references other than poses do not count.
     """
-    rows, loss = _Rows(problem), make_loss(problem.loss, 3)
+    rows, loss = _Rows(problem) if about is None else _LinearRows(problem, about), make_loss(problem.loss, 3)
     unknowns = np.zeros(problem.root.shape[1] + len(problem.unknowns) + rows.gyros)
     if near is not None:
         common = min(len(unknowns), len(near.unknowns)) if near.root.shape[0] == problem.size else problem.root.shape[1]
@@ -232,14 +258,16 @@ def estimate(
         step = -np.linalg.solve(information.sum(axis=0) + np.eye(len(unknowns)), scores.sum(axis=0) + unknowns)
         unknowns, steps = unknowns + step, steps + 1
         at_rest = steps > _FIRST_STEPS and bool(np.abs(step).max() < _RESTING)
-    matrix, terms = problem.answer(unknowns)
-    root = np.zeros((matrix.size + len(problem.unknowns), len(unknowns)))
+    values = problem.values(unknowns)
+    matrix = values[: len(problem.root)].reshape(problem.robot.inverse_kinematic_matrix.shape)
+    terms = problem.answer(unknowns)[1] if about is None else ()
+    root = np.zeros((problem.size, len(unknowns)))
     root[: matrix.size, : problem.root.shape[1]] = problem.root
     for number, unknown in enumerate(problem.unknowns):
         root[matrix.size + number, problem.root.shape[1] + number] = unknown.deviation
     information = rows.curvature(errors, slopes, drifts, weights, excess, loss)
     kinds = dict(zip(rows.kinds, excess.tolist(), strict=True))
-    return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps - first, at_rest)
+    return Estimate(matrix, terms, unknowns, root, information, scores, kinds, steps - first, at_rest, values)
 
 
 class _Rows:
@@ -337,13 +365,7 @@ class _Rows:
         for logs, firsts, seen in self._driven(terms):
             odometry = OdometryBatch(logs, self._problem.integration)
             poses = odometry.poses(matrix[None])[0]
-            # The medians of each stretch, those of one length at once
-            counts = np.diff([*firsts, len(poses)])
-            medians, apart = np.empty((len(firsts), 3)), poses - seen
-            for count in np.unique(counts).tolist():
-                alike = np.flatnonzero(counts == count)
-                medians[alike] = np.median(apart[firsts[alike][:, None] + np.arange(count)], axis=1)
-            errors += list(medians)
+            errors += list(_medians(poses - seen, firsts))
             if slopes:
                 jacobians.append(_means(odometry.jacobian(matrix).reshape(len(poses), 3, -1), firsts))
         if self._references is not None:
@@ -441,6 +463,42 @@ class _Rows:
         sums = np.zeros((len(self._problem.runs), *values.shape[1:]))
         np.add.at(sums, self.run, values)
         return sums
+
+
+class _LinearRows(_Rows):
+    """The rows of errors of a problem about a linearisation."""
+
+    def __init__(self, problem: EstimateProblem, about: Linearisation) -> None:
+        super().__init__(replace(problem, runs=[replace(run, references=None) for run in problem.runs]))
+        index = [chosen - 1 for chosen, _ in self._chosen]  # of the poses after the start
+        starts = np.cumsum([0, *map(len, index)])
+        self._firsts = np.concatenate([first + start for (_, first), start in zip(self._chosen, starts, strict=False)])
+        self._about = about.values
+        self._errors, self._columns, self._drifts = (
+            np.concatenate([of_run[rows] for of_run, rows in zip(values, index, strict=True)])
+            for values in (about.errors, about.columns, about.drifts)
+        )
+
+    def linearised(self, unknowns: Array) -> tuple[Array, Array]:
+        problem = self._problem
+        apart = self._errors + self._columns @ (problem.values(unknowns) - self._about)
+        scales = [unknown.deviation for unknown in problem.unknowns]
+        slopes, elements = _means(self._columns, self._firsts), len(problem.root)
+        by_elements = slopes[..., :elements] @ problem.root
+        return _medians(apart, self._firsts), np.concatenate([by_elements, slopes[..., elements:] * scales], axis=2)
+
+    def drifts(self, unknowns: Array) -> Array:  # noqa: ARG002
+        deviations = self._problem.nuisances.deviations
+        return _means((self._drifts * deviations)[..., deviations > 0], self._firsts)
+
+
+def _medians(values: Array, firsts: NDArray[np.intp]) -> Array:
+    """Medians (S, 3) of values (K, 3) over stretches that begin at ``firsts``, those of one length at once."""
+    counts, medians = np.diff([*firsts, len(values)]), np.empty((len(firsts), 3))
+    for count in np.unique(counts).tolist():
+        alike = np.flatnonzero(counts == count)
+        medians[alike] = np.median(values[firsts[alike][:, None] + np.arange(count)], axis=1)
+    return medians
 
 
 def _means(values: Array, firsts: NDArray[np.intp]) -> Array:

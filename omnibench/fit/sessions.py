@@ -83,7 +83,7 @@ _ROUNDING = 1e-6
 # Chance at which sessions are said to differ that do not, over all that is tested: strict, as one such answer in a
 # hundred is too many, and enough to see 0.5 % of one radius in 60 + 60 runs (tests/studies/session_study.py).
 CHANCE = 0.001
-# Level of the tests for nuisances, that of discover (discover/fitting.py).
+# Level of the tests for nuisances, that of discover (discover/fit.py).
 _NUISANCES = 1e-4
 # Chance of what is left from which on a change of radii counts as all that differs: chosen; words alone hang on it.
 _ALL = 0.01

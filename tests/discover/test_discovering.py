@@ -17,7 +17,7 @@ from recording_samples import in_room
 from omnibench.config import validate
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
 from omnibench.data.splits import joined
-from omnibench.discover import discover
+from omnibench.discover import discover, select
 from omnibench.discover.discover import discover_effects
 from omnibench.discover.held_out import validation_runs
 from omnibench.discover.report.discovery_report import discovery_report

@@ -123,7 +123,7 @@ def _largest(start: Given, groups: Sequence[Group], count: int) -> list[Group]:
 
 
 def _discrepancy(start: Given, right: Sequence[Group], others: Sequence[Group]) -> tuple[float, ...]:
-    """(Q / d - 1) / N of the other effects beyond the right ones: delta^2 of Eq. (3) in evidence.py, along each."""
+    """(Q / d - 1) / N of the other effects beyond the right ones: delta^2 of Eq. (3) of select.py (1), along each."""
     after = start.given(indices_of(right))
     energy = start.chi_square(indices_of(right)) - start.rank(indices_of(right))
     seen = [(after.chi_square(group.index), after.rank(group.index)) for group in others]
@@ -150,7 +150,7 @@ def _names(screening: Screening, chosen: Sequence[Group], rng: np.random.Generat
 
 
 def print_table(results: Sequence[Result]) -> None:
-    """The figures that evidence.py names."""
+    """The figures that select.py names."""
     of_sets = [result.discrepancy for result in results if result.kind == "single"]
     print(f"discrepancy along other effects, {len(of_sets)} sets with one effect")
     for words, squares in (("mean", map(np.mean, of_sets)), ("largest", map(max, of_sets))):
