@@ -22,6 +22,7 @@ from omnibench.discover.screening import Screening
 from omnibench.environment import package_versions
 from omnibench.errors import DataError
 from omnibench.fit.calibrator import calibration_of_fit
+from omnibench.fit.estimate import LOST_RATE
 from omnibench.fit.path_errors import slip_of
 from omnibench.fit.prior import default_mount
 from omnibench.fit.sessions import SessionComparison
@@ -45,14 +46,19 @@ def conclude(confirmed: Confirmed, choices: Mapping[str, Any]) -> result.Discove
     held_out = validating.compare_held_out(baseline, extended, validation, folds)
     sessions = validating.compare_with_validation(extended, validation)
     eq6_of_sessions = validating.eq6_with_changes(extended, validation.runs, sessions)
-    verdict = result.verdict_of(effects, where, left)
+    verdict, above = result.verdict_of(effects, where, left), None
+    if verdict == "none":  # not while errors are above their floor, which sessions that differ would explain, too
+        same = not sessions.differences and sessions.other_commands is None
+        gaps = (held.eq6 for held in held_out if held.data == "repetitions" or same)
+        above = next((gap for gap in gaps if gap.beyond_chance), None)
+        verdict = "none" if above is None else "unknown"
 
     # Sentences on sessions and models for the top of the report, and notes
     inliers, few = fit.at_inliers.runs, result.few_in_words(fit.runs)
     trained = {run.session for run in fit.runs}
     of_sessions = sessions_in_words(verdict, sessions, held_out, eq6_of_sessions, trained)
     differ, untested = bool(of_sessions), bool(sessions.doubts)
-    of_model = headline_of(verdict, effects, where, left, few, differ=differ, untested=untested)
+    of_model = headline_of(verdict, effects, where, left, few, above, differ=differ, untested=untested)
     doubts = sessions.doubts if verdict == "none" else ()
     warnings = _warnings(held_out, session=result.is_other_session(fit.runs, validation.runs))
     headline = " ".join([*of_sessions, of_model, *doubts, *warnings])
@@ -60,6 +66,9 @@ def conclude(confirmed: Confirmed, choices: Mapping[str, Any]) -> result.Discove
     if verdict != "none":  # else the headline says it
         notes += [*sessions.of_other_commands, *sessions.doubts]
         notes += [f"These are {few}: so little can show hardly anything."] if few else []
+    notes += [f"The extended model holds {LOST_RATE[0]}, as what calibrate gives does: robots of this class lose it."
+              for term in fit.model.terms if term.effect.name == LOST_RATE[0] and LOST_RATE[0] not in
+              {name for effect in effects for name in (effect.name, *effect.confusable_with)}]  # fmt: skip
     notes += [*_notes(fit, screening, proposal.sums), *confirmed.notes, *filter(None, [confirmed.average.note])]
     absorbed = tuple(each for each in proposal.absorbed if each.name != "tyre_wear" or not worn(sessions, trained))
     needs_session = any("session" in term.effect.needs for term in fit.model.terms)
@@ -109,13 +118,15 @@ def headline_of(
     where: Sequence[result.CovariateDependence],
     left: Sequence[result.CovariateDependence],
     few: str = "",
+    above: result.Gap | None = None,
     *,
     differ: bool = False,
     untested: bool = False,
 ) -> str:
     """One or two sentences for the top of a report.
 
-    few: the training runs in words if they can show hardly anything. differ: True if sentences on sessions that deviate
+    few: the training runs in words if they can show hardly anything. above: the gap, where nothing else shows that
+    something is missing. differ: True if sentences on sessions that deviate
     stand before these. untested: True if sessions could not be compared.
     """
     names = "; ".join(" or ".join((effect.name, *effect.confusable_with)) for effect in effects)
@@ -127,6 +138,11 @@ def headline_of(
     odometry = "Nothing is missing in the odometry that these recordings could show"
     if differ or untested:
         odometry = f"{found} in the odometry of the training runs"
+    if above is not None:
+        return (
+            f"Something is missing that depends on nothing that was tried: Eq. (6) of held-out runs is "
+            f"{above.before:.3g}, and repetitions leave {above.floor:.3g}."
+        )
     if verdict == "none" and where:
         return f"{odometry}. How the motors follow their targets has no name: {surest}."
     if verdict == "none" and few:

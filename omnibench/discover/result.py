@@ -5,6 +5,7 @@ It serialises itself as ``discovery.json``, which ``omnibench discover`` writes 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,6 +29,7 @@ SURE = 0.95  # weight of a name from which on it counts as sure, as the verdict 
 # Probability that an effect is named where none is missing: in one robot of 500. With half or twice of it no verdict
 # changes (tests/studies/constants.py).
 CHANCE = 0.002
+_NORMAL_CHANCE = 2.88  # standard deviations that a normal number exceeds with that probability
 _FEW_RUNS = 10  # with fewer, the signs of runs flip in less than 2^9 ways, and no chance falls below CHANCE, 0.002
 _FEW_COMMANDS = 4  # up to three motions are what some matrix makes of any wheel rates: nothing contradicts it
 _NOT_WRITTEN = Field(exclude=True)
@@ -162,6 +164,11 @@ class Gap:
     floor: float | None
     closed: float | None
     standard_error: float | None
+
+    @property
+    def beyond_chance(self) -> bool:
+        """True if the plain matrix errs more than repetitions allow, by more than chance makes at CHANCE."""
+        return self.floor is not None and self.before - self.floor > _NORMAL_CHANCE * (self.standard_error or math.inf)
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,18 @@ from omnibench.words import plural
 def discovery_report(discovery: Discovery, options: str) -> page.Document:
     """The report as blocks. options: the effective options, in YAML."""
     dataset = discovery.dataset
-    unseen = [tables.unseen_table(discovery)] if discovery.measurements or discovery.not_looked_for else []
-    alike = "Effects that look alike here, and how large one that was not found could be."
+    alike = "Step 3, propose: effects that look alike or that no run would show, and how large one could be."
     titles: tuple[tuple[str, str, str, Iterable[page.Block]], ...] = (
-        ("where", "Where it shows", "What the errors of the plain matrix depend on.", _where(discovery)),
-        ("evidence", "Evidence for and against", "What each effect would explain.", evidence_blocks(discovery)),
-        ("parameters", "Parameters", "The effects that were added.", parameter_blocks(discovery)),
+        ("where", "Where it shows", "Step 2, locate: what the errors of the plain matrix depend on.", _where(discovery)),
         ("alike", "What the data cannot tell", alike, alike_blocks(discovery)),
-        ("better", "Errors before and after", "Down to the floor of the noise.", _errors(discovery)),
+        ("evidence", "Evidence for and against", "Step 4, select: what each effect would explain.",
+         evidence_blocks(discovery)),
+        ("better", "Errors before and after", "Step 5, confirm: on runs held out, down to the floor of the noise.",
+         _errors(discovery)),
+        ("parameters", "Parameters", "Step 6, conclude: the effects that were found.", parameter_blocks(discovery)),
         ("drive", "What to drive next", "The runs that tell look-alikes apart.", experiment_blocks(discovery)),
-        ("absorbed", "What no run would show", "Effects that a matrix holds.", unseen),
-        ("basis", "How to reproduce", "Data, noise, options and files.", _basis(discovery, options)),
-    )
+        ("basis", "How to reproduce", "Step 1, fit: data and noise; options and files.", _basis(discovery, options)),
+    )  # fmt: skip
     sections = (
         page.Section(key, title, blocks, about=about, folded=True)
         for key, title, about, made in titles
@@ -137,6 +137,8 @@ def alike_blocks(discovery: Discovery) -> Iterator[page.Block]:
         yield page.Callout("What these data cannot tell apart", classes)
     if discovery.hidden:
         yield tables.hidden_table(discovery.hidden)
+    if discovery.measurements or discovery.not_looked_for:
+        yield tables.unseen_table(discovery)
 
 
 def _errors(discovery: Discovery) -> Iterator[page.Block]:
