@@ -18,9 +18,9 @@ from omnibench.words import plural
 def discovery_report(discovery: Discovery, options: str) -> page.Document:
     """The report as blocks. options: the effective options, in YAML."""
     dataset = discovery.dataset
-    alike = "Step 3, propose: effects that look alike or that no run would show, and how large one could be."
+    alike = "Step 3, propose: effects that look alike or that no run shows, and how large one could be."
     titles: tuple[tuple[str, str, str, Iterable[page.Block]], ...] = (
-        ("where", "Where it shows", "Step 2, locate: what the errors of the plain matrix depend on.", _where(discovery)),
+        ("where", "Where it shows", "Step 2, locate: what the plain matrix's errors depend on.", _where(discovery)),
         ("alike", "What the data cannot tell", alike, alike_blocks(discovery)),
         ("evidence", "Evidence for and against", "Step 4, select: what each effect would explain.",
          evidence_blocks(discovery)),
