@@ -149,9 +149,13 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
     estimates = [(weight, _estimated(model, usual)) for weight, model in weighted]
     average = averaged(estimates)
     baseline = most_probable(average.extended.fit, (), np.zeros(0))
-    if usual is not None and average.extended.groups == (usual,):  # alone, it is left out where it may be nothing
-        elements = plain.model.matrix.size
-        if (np.abs(average.extended.values) <= average.extended.covariance.reach[elements:]).all():
+    if usual is not None and average.extended.groups == (usual,):  # alone, it is left out where it is next to nothing
+        ends, errors = (
+            np.array([of_run[-1] for of_run in values])
+            for values in (average.extended.fit.poses, average.extended.fit.residuals)
+        )
+        changes = ends - [of_run[-1] for of_run in baseline.fit.poses]
+        if np.linalg.norm(changes, axis=1).mean() < _NOTHING * np.linalg.norm(errors, axis=1).mean():
             average = AveragedModel(baseline, ((1.0, baseline),))
     if explained:
         models = replace(models, used=estimates[0][1])
@@ -204,6 +208,7 @@ def _estimated(model: Extended, usual: Group | None) -> Extended:
     return most_probable(model.fit, [*model.groups, usual], np.append(model.values, np.zeros(len(usual.parameters))))
 
 
+_NOTHING = 0.1  # share of the final errors: what the usual effect changes less is chance of the fit (chosen)
 _UNCONFIRMED = 0.5  # probability, at most, of names by which held-out kinds of motion do not gain
 # Share of a column that must be left beyond the others, as in spline_term.py: much of a form is another matrix.
 _DETERMINED = 0.01
