@@ -46,7 +46,9 @@ def make(
 @exam_app.command()
 def grade(
     folder: Path = _EXAM,
-    answers: Path = argument("ANSWERS.json (sealed.json has its schema), or a folder of SET/discovery.json.", ...),
+    answers: Path = argument(
+        "ANSWERS.json (sealed.json has its schema), or a folder of SET/discovery.json.", ..., metavar="ANSWERS"
+    ),
     seed: int = option("Seed that exam make printed.", default=..., min=0),
     as_json: bool = shared.JSON,
 ) -> None:

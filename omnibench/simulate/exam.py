@@ -269,36 +269,24 @@ class EffectView:
         return OdometryModel(self.robot, matrix, "arc", terms, self.config.sample_period).reported(self._logs)
 
     @cached_property
-    def _factors(self) -> list[tuple[Array, Array]]:
-        """Inverse factors (K, K) of the covariances of each run's positions and headings.
-
-        White noise of wheel rates is a random walk of the poses.
-        """
+    def _inverse_factors(self) -> list[Array]:
+        """L^-1 (3, K, K) of each run, for x, y and heading; white noise of the wheel rates adds to the random walk."""
         noise, matrix = self.config.noise, self.matrix
         rates = noise.encoder * math.sqrt(self.config.sample_period)  # rad per sqrt s
-        walks = (
-            math.hypot(noise.walk_position, rates * float(np.linalg.norm(matrix[:2])) / math.sqrt(2)),
-            math.hypot(noise.walk_heading, rates * float(np.linalg.norm(matrix[2]))),
-        )
-        whites, biases = (noise.pose_position, noise.pose_heading), (noise.bias_position, noise.bias_heading)
-        factors = []
-        for log in self._logs:
-            common, one = np.minimum(log.stamps[:, None], log.stamps), np.eye(len(log.stamps))
-            position, heading = (
-                np.linalg.inv(np.linalg.cholesky(white**2 * one + bias**2 + walk**2 * common))
-                for white, walk, bias in zip(whites, walks, biases, strict=True)
-            )
-            factors.append((position, heading))
-        return factors
+        by_rates = rates * np.array([np.linalg.norm(matrix[:2]) / math.sqrt(2), np.linalg.norm(matrix[2])])
+        white = np.square([noise.pose_position, noise.pose_heading])
+        walk = np.square([noise.walk_position, noise.walk_heading]) + by_rates**2
+        bias = np.square([noise.bias_position, noise.bias_heading])
+        white, walk, bias = (variances[[0, 0, 1], None, None] for variances in (white, walk, bias))
+        return [
+            np.linalg.inv(np.linalg.cholesky(white * np.eye(len(t)) + walk * np.minimum(t[:, None], t) + bias))
+            for t in (log.stamps for log in self._logs)
+        ]
 
     def _whitened(self, poses: Sequence[Array]) -> Array:
         """Change (n,) of all poses, each run's (K, 3), from those before, of unit variance."""
-        changes = [after - before for after, before in zip(poses, self._before, strict=True)]
-        parts = [
-            (position @ change[:, :2], heading @ change[:, 2:])
-            for (position, heading), change in zip(self._factors, changes, strict=True)
-        ]
-        return np.concatenate([part.ravel() for of_run in parts for part in of_run])
+        changed = zip(self._inverse_factors, poses, self._before, strict=True)
+        return np.concatenate([(factor @ (after - before).T[:, :, None]).ravel() for factor, after, before in changed])
 
 
 def _sized(

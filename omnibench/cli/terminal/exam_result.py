@@ -45,7 +45,8 @@ class ExamResult(Result):
             rate = self.marks.rates[name]
             share = "" if rate.share is None else f"{100 * rate.share:.0f} %"
             interval = "" if rate.share is None else f"{100 * rate.low:.0f} to {100 * rate.high:.0f} %"
-            rows.append(Row.of(words, f"{rate.count:g} of {rate.of:g}", share, interval))
+            count = "" if name == "place_f1" else f"{rate.count:g} of {rate.of:g}"
+            rows.append(Row.of(words, count, share, interval))
         figures = Table("figures", columns("figure", "count", "share", "95 % interval"), tuple(rows))
         marked = []
         for each in self.marks.by_set:
