@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from omnibench.cli.calibration_commands import calibration_app
+from omnibench.cli.exam_commands import exam_app
 from omnibench.cli.guide_commands import guide_app
 from omnibench.cli.live_commands import live_app
 from omnibench.cli.recording_commands import recording_app
@@ -22,6 +23,7 @@ FAMILIES = (
     ("Live", live_app),
     ("Learn and extend", guide_app),
 )
+calibration_app.add_typer(exam_app, name="exam")
 
 
 class CommandsByFamily(TyperGroup):

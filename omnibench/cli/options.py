@@ -73,11 +73,13 @@ _NAMES = {
     "calibrator": names_in("omnibench.registry:calibrators.entries"),
     "cost": names_in("omnibench.registry:costs.entries"),
     "effect": names_in("omnibench.registry:effects.entries"),
+    "effects": names_in("omnibench.registry:effects.entries"),
+    "robots": names_in("omnibench.simulate.exam:ROBOTS"),
     "without": names_in("omnibench.registry:effects.entries"),
 }
 _METAVARS = {
-    "area": "AxB", "effect": "YAML", "like": "DATASET", "model": "CALIBRATION", "robot": "FILE", "truth": "DIR",
-    "without": "NAME",
+    "area": "AxB", "effect": "YAML", "effects": "NAME,...", "like": "DATASET", "model": "CALIBRATION", "robot": "FILE",
+    "robots": "NAME,...", "truth": "DIR", "without": "NAME",
 }  # fmt: skip
 
 

@@ -45,7 +45,7 @@ def simulate_flower(
     robot = truth.true_robot()
     trajectories: list[Trajectory] = []
     for split, session in config.sessions.items():
-        for run in _flower_session(config, robot, split, session):
+        for run in flower_session(config, robot, split, session):
             trajectories.append(run)
             watch(Progress(f"simulating {name}", len(trajectories), config.runs, "run"))
     watch(Progress(f"simulating {name}", len(trajectories), result=""))
@@ -94,7 +94,7 @@ def true_steering(robot: Robot, run: Trajectory, variation: Variation = STEADY) 
     return commanded_steering(robot, command, run.times, variation)
 
 
-def _flower_session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
+def flower_session(config: FlowerConfig, robot: TrueRobot, split: Split, session: Session) -> Iterator[Trajectory]:
     """The runs: targets and steering by the design values, wheel rates by the motors, motion by the true robot.
 
     Encoders are exact between runs, so that recorded and true wheel angles do not drift apart: the angles (N,) at a

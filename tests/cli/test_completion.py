@@ -23,6 +23,8 @@ def line(typed: str) -> dict[str, str]:
         ("omnibench calibrate --box ", {"paper", "row"}),
         ("omnibench discover data --without heading_d", {"heading_drift"}),
         ("omnibench simulate --effect heading_d", {"heading_drift"}),
+        ("omnibench exam make exam --effects heading_d", {"heading_drift"}),
+        ("omnibench exam make exam --robots diff", {"differential"}),
         ("omnibench import ros", {"rosbag"}),
         ("omnibench check data --format ros", {"rosbag"}),
         ("omnibench export c.yaml --to c", {"c_header"}),
