@@ -27,7 +27,7 @@ import hashlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from sys import path as import_path
@@ -61,6 +61,7 @@ LEVEL = 0.05  # probability that any of the intervals is wrong
 WORSE = 1.05  # ratio of Eq. (6) from which on a row is worse
 WINDOW = 10.0  # s, in which drives are judged
 _FEW = 8  # runs that are left out at least: sessions of fewer go together with the next of their kind
+_HALF_OF_CORELLI = 57.0  # s
 _SCALE = 0.4  # rad of DART's steering for a command of 1, as ``omnibench check`` says
 
 Chooses = Callable[[Trajectory], bool]
@@ -69,7 +70,8 @@ Chooses = Callable[[Trajectory], bool]
 class Row(Model):
     """One way to train and to judge. errors: final errors of the judged runs by each model, m, m, rad.
 
-    terms: effects of the extended model, "name parameter=value". seconds: of discover and of both calibrations.
+    terms: effects of the extended model, "name parameter=value". seconds: processor time of discover and of both
+    calibrations.
     """
 
     robot: str
@@ -123,6 +125,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="file of results, one line of JSON a row")
     parser.add_argument("--only", nargs="+", default=list(ROBOTS), choices=list(ROBOTS), metavar="ROBOT")
     parser.add_argument("--what", nargs="+", default=list(WHATS), choices=list(WHATS), metavar="WHAT")
+    parser.add_argument("--rows", default="", metavar="TEXT", help="only rows whose key holds it, as in 'circular -> '")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")
     arguments = parser.parse_args()
     file, code = ResultsFile(arguments.out, Row), code_digest()
@@ -131,7 +134,8 @@ def main() -> None:
         for robot in arguments.only:
             recording = ROBOTS[robot]()
             for way in ways_of(robot, recording):
-                if way.what in arguments.what and f"{robot}: {way.train} -> {way.judge}" not in done:
+                key = f"{robot}: {way.train} -> {way.judge}"
+                if way.what in arguments.what and arguments.rows in key and key not in done:
                     row = carry_out(recording, robot, way, code)
                     file.add(row)
                     print(f"{row.key}: {row.verdict or row.failure}, {sum(row.seconds):.0f} s", flush=True)
@@ -148,35 +152,36 @@ def code_digest() -> str:
 
 
 def carry_out(recording: Dataset, robot: str, way: Way, code: str) -> Row:
-    """Discover and calibrate on the runs that train, and judge all models on the others."""
+    """Calibrate and discover on the runs that train, and judge all models on the others."""
     trained, judged = split_by(recording, way)
-    row = Row(robot=robot, what=way.what, train=way.train, judge=way.judge, code=code, runs=(len(trained), len(judged)))
+    size = (len(trained), len(judged))
+    row = Row(robot=robot, what=way.what, train=way.train, judge=way.judge, code=code, runs=size)
+    errors: dict[str, tuple[tuple[float, float, float], ...]] = {}
+
+    def judge(name: str, calibration: Calibration) -> None:
+        errors[name] = tuple(map(tuple, final_errors(calibration.model, judged).tolist()))
+
+    began = calibrated = time.process_time()
     try:
         with one_thread():
             dataset = make_dataset(robot, recording.robot, recording.sample_period, [*trained, *judged])
-            began = time.perf_counter()
+            judge("plain", calibrate(dataset, options={"lost_rate": 0}).calibration)
+            judge("default", calibrate(dataset).calibration)
+            calibrated = time.process_time()
             found = discover_effects(dataset)
-            discovered = time.perf_counter()
-            default = calibrate(dataset).calibration
-            plain = calibrate(dataset, options={"lost_rate": 0}).calibration
-            seconds = (discovered - began, time.perf_counter() - discovered)
-            models = (plain, found.plain, default, found.extended)
-            errors = [tuple(map(tuple, final_errors(model.model, judged).tolist())) for model in models]
-    except OmnibenchError as error:
-        return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
+            terms = tuple(terms_of(found.extended))
+            names = tuple(
+                f"{' or '.join((each.name, *each.confusable_with))} {each.weight:.2f}/{each.class_weight:.2f}"
+                for each in found.effects
+            )
+            row = row.model_copy(update={"verdict": found.verdict, "names": names, "terms": terms})
+            judge("matrix", found.plain)
+            judge("extended", found.extended)
     except Exception as error:  # the study goes on, and the table says so
-        return row.model_copy(update={"failure": f"TRACEBACK {type(error).__name__}: {error}"})
-    return Row(
-        **row.model_dump(exclude={"verdict", "names", "terms", "errors", "seconds"}),
-        verdict=found.verdict,
-        names=tuple(
-            f"{' or '.join((each.name, *each.confusable_with))} {each.weight:.2f}/{each.class_weight:.2f}"
-            for each in found.effects
-        ),
-        terms=tuple(terms_of(found.extended)),
-        errors=dict(zip(MODELS, errors, strict=True)),
-        seconds=seconds,
-    )
+        expected = "" if isinstance(error, OmnibenchError) else "TRACEBACK "
+        row = row.model_copy(update={"failure": f"{expected}{type(error).__name__}: {error}"})
+    seconds = (time.process_time() - calibrated, calibrated - began)
+    return row.model_copy(update={"errors": errors, "seconds": seconds})
 
 
 def split_by(recording: Dataset, way: Way) -> tuple[list[Trajectory], list[Trajectory]]:
@@ -214,7 +219,8 @@ def print_table(rows: Sequence[Row]) -> None:
     for row in rows:
         print(f"{row.key:60}{row.runs[0]:>4}+{row.runs[1]:<3}", end=" ")
         if row.failure:
-            print(f"failed: {row.failure}")
+            costs = ", ".join(f"{model} {row.costs(model).mean():.4f}" for model in row.errors)
+            print(f"failed: {row.failure}; {costs}")
             continue
         costs = "".join(f"{row.costs(model).mean():9.4f}" for model in MODELS)
         ratios = " ".join(f"{row.ratio('extended', other):7.3f}" for other in OTHERS)
@@ -304,9 +310,9 @@ def ways_of(robot: str, recording: Dataset) -> Iterator[Way]:
         yield from _both_ways("drive", "slow drives", "fast drives", slow, fast)
         return
     if robot == "corelli":
-        early = lambda run: (run.started_at or 0) < 57  # noqa: E731
+        early = _one_of({run.id for run in runs if (run.started_at or 0) < _HALF_OF_CORELLI})
         yield from _both_ways("half", "first half", "second half", early, _not(early))
-        even = lambda run: int(run.id.rsplit("#", 1)[1]) % 2 == 0  # noqa: E731
+        even = _one_of({run.id for run in runs if int(run.id.rsplit("#", 1)[1]) % 2 == 0})
         yield from _both_ways("half", "even windows", "odd windows", even, _not(even))
         return
     if robot == "robotino":
@@ -329,11 +335,11 @@ def ways_of(robot: str, recording: Dataset) -> Iterator[Way]:
             if all(any(word in (run.command or "") for run in of_kind) for word in (one, two)):
                 chosen = (_both(_group(kind), _has(word)) for word in (one, two))
                 yield from _both_ways("direction", f"{kind}{one}", f"{kind}{two}", *chosen)
-        number, first = dict[str | None, int](), set[str]()
+        counts, first = dict[str | None, int](), set[str]()
         for run in of_kind:
-            number[run.command] = number.get(run.command, -1) + 1
-            first |= {run.id} if number[run.command] % 2 == 0 else set()
-        half = _both(_group(kind), lambda run, first=first: run.id in first)
+            counts[run.command] = counts.get(run.command, -1) + 1
+            first |= {run.id} if counts[run.command] % 2 == 0 else set()
+        half = _one_of(first)
         yield Way("half", f"{kind}, half", "its repetitions", half, _both(_group(kind), _not(half)))
     for kind in kinds:
         together: list[str] = []
@@ -371,6 +377,10 @@ def _both(*chooses: Chooses) -> Chooses:
 
 def _not(chooses: Chooses) -> Chooses:
     return lambda run: not chooses(run)
+
+
+def _one_of(ids: Collection[str]) -> Chooses:
+    return lambda run: run.id in ids
 
 
 def _session(*names: str) -> Chooses:
