@@ -55,6 +55,9 @@ _SHORTEST = (
 )
 
 
+_MOST_POSES = 120  # reference poses of a run that are looked at; chosen
+
+
 def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
     """The runs; where they are few, and no command is repeated, their parts of equal length."""
     repeated = any(len(members) > 1 for members in reference_noise.grouped([run.command or run.id for run in runs]))
@@ -75,6 +78,19 @@ class PlainFit:
     fit: Fit
 
 
+def thinned(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
+    """The runs with at most 120 of their reference poses each, the first and the last among them.
+
+    More say no more of a robot than slip lets them, and the covariance of a run's poses takes time by their square.
+    """
+    chosen = []
+    for run in runs:
+        poses = len(run.pose_times)
+        index = np.round(np.linspace(0, poses - 1, _MOST_POSES)).astype(int)
+        chosen.append(run if poses <= _MOST_POSES else fits.with_poses(run, index))
+    return tuple(chosen)
+
+
 def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> PlainFit:
     """Fit the plain matrix from the design, or from a calibration's matrix without effects.
 
@@ -92,9 +108,10 @@ def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> Plain
         calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
         start = calibration.matrix_without_effects
     recorded = dataset.split("train")
-    runs = fits.usable_runs(in_windows([run for run in recorded if run.has_poses]) or recorded)
+    runs = thinned(fits.usable_runs(in_windows([run for run in recorded if run.has_poses]) or recorded))
     try:
-        repeating = fits.usable_runs(reference_noise.repeating_runs(runs, dataset.split("validation")), "validation")
+        repeating = reference_noise.repeating_runs(runs, dataset.split("validation"))
+        repeating = thinned(fits.usable_runs(repeating, "validation"))
     except DataError:
         repeating = ()
     return PlainFit(dataset, fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating))

@@ -541,8 +541,12 @@ class Robot(Shown, Model):
 
     @property
     def reach(self) -> float:
-        """Mean distance of the wheels from the robot's centre, m: turning counts as the speed that it gives them."""
-        return float(np.mean([wheel.reach for wheel in self.measured]))
+        """Mean distance of the wheels from the robot's centre, m: turning counts as the speed that it gives them.
+
+        Of the measured ones, or where these stand in the centre, of all; 1 if no wheel stands elsewhere.
+        """
+        measured, every = (float(np.mean([wheel.reach for wheel in of])) for of in (self.measured, self.wheels))
+        return measured or every or 1.0
 
     @property
     def inverse_kinematic_matrix(self) -> Array:

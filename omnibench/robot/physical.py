@@ -128,7 +128,7 @@ class Geometry:
     def numbers(self) -> tuple[Number, ...]:
         """The numbers at their design values; the pose of the tracked point stands last."""
         robot, mount = self.robot, self.robot.mount or kinematics.Mount()
-        reach = robot.reach or 1.0  # 0 for one wheel at the centre
+        reach = robot.reach
         tracked = (
             Number("mount_x", "", mount.x, reach),
             Number("mount_y", "", mount.y, reach),
