@@ -24,6 +24,7 @@ from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, code_digest, content_key, run_jobs
 
 _GROUPS: tuple[Group, ...] = ("matched", "single", "third", "outside", "null")
+_SMALL = "small_sessions"  # 70 runs to fit, of 14 commands in three sessions: a fifth of the time
 _STRIDES = 7  # from one effect to the next, prime to the numbers of effects: few sets have many of them
 HEAD = (
     "method", "right name", "or class", "right, sure", "wrong, sure", "says none: null", "no sure name: outside",
@@ -37,7 +38,7 @@ def main() -> None:
     store, names = ResultStore(arguments.out, Result), tuple(arguments.only or RIVALS)
     every = arguments.kinds_every
     jobs = [
-        _job(task, names, kinds=bool(every) and number % every == 0)
+        _job(task, names, kinds=bool(every) and number % every == 0, design=_SMALL if arguments.small else None)
         for number, task in enumerate(sets(arguments.sets, arguments.first_seed))
     ]
     if not arguments.table:
@@ -129,11 +130,11 @@ class _Said(JobWatch[Result]):
             print(f"{number + 1}: {said}", flush=True)
 
 
-def _job(task: Task, names: tuple[str, ...], *, kinds: bool) -> Job[Result]:
+def _job(task: Task, names: tuple[str, ...], *, kinds: bool, design: str | None) -> Job[Result]:
     folder = Path(__file__).parent
     code = discovering_code() + code_digest(folder, folder.glob("rivals/*.py"))
-    facts = {"task": task, "rivals": names, "kinds": kinds, "code": code}
-    return Job(content_key(facts), carry_out, (task, names, kinds))
+    facts = {"task": task, "rivals": names, "kinds": kinds, "design": design, "code": code}
+    return Job(content_key(facts), carry_out, (task, names, kinds, design))
 
 
 def _arguments() -> argparse.Namespace:
@@ -145,6 +146,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--kinds-every", type=int, default=1, help="ask again without a kind of motion on every so manyth set; 0: none"
     )
+    parser.add_argument("--small", action="store_true", help="sets of 70 + 70 runs, for settings")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--backend", default="processes", help="processes, dask, or a scheduler's tcp://HOST:PORT")
     parser.add_argument("--table", action="store_true", help="print the table of what is there")

@@ -88,12 +88,17 @@ class Result(Model):
     figures: dict[str, Figures]
 
 
-def carry_out(asked: tuple[Task, tuple[str, ...], bool], _: Reporter) -> Result:
-    """Make a set, ask rivals, judge. The last is True if they are asked again without a kind of motion, too."""
-    task, rivals, kinds = asked
+def carry_out(asked: tuple[Task, tuple[str, ...], bool, str | None], _: Reporter) -> Result:
+    """Make a set, ask rivals, judge.
+
+    asked: task, rivals, True if they are asked again without a kind of motion, and the design, None for the usual one.
+    """
+    task, rivals, kinds, design = asked
     with one_thread():
         noise = NULL_KINDS[task.seed % len(NULL_KINDS)] if task.group == "null" else "plain"
-        dataset, truth = make_set(task.kind, task.effects, task.level, task.seed, form=task.form, noise=noise)
+        dataset, truth = make_set(
+            task.kind, task.effects, task.level, task.seed, form=task.form, noise=noise, design=design
+        )
         began = time.process_time()
         problem, figures = make_problem(dataset), dict[str, Figures]()
         _ = problem.screening
@@ -121,9 +126,9 @@ def carry_out(asked: tuple[Task, tuple[str, ...], bool], _: Reporter) -> Result:
 
 def judged(answer: Answer, truth: Truth, problem: Problem, clean: Sequence[Trajectory]) -> Figures:
     """The answer beside the truth. clean: validation runs without noise."""
-    hidden = set(truth.names)
+    hidden = set(truth.called if truth.kind == "outside" else truth.names)  # in the catalogue
     first = answer.names[0][0] if answer.names and not answer.unnamed else ""
-    shown = {effects.create(name).shows_in for name in hidden} | set(truth.covariates)
+    shown = set(truth.covariates) or {effects.create(name).shows_in for name in hidden}
     measurable = bool(truth.hidden) and "tyre_wear" not in hidden
     return Figures(
         names=answer.names,

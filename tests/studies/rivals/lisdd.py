@@ -1,4 +1,4 @@
-"""LISDD (Y. Wang, "Where is my physics wrong?", arXiv 2606.23215, 2026), from its abstract; no code is published.
+"""LISDD (Y. Wang, "Where is my physics wrong?", arXiv 2606.23215, 2026), from its abstract; no code was at hand.
 
 Localised, identifiable sparse discovery of discrepancy: the known physics (here the matrix) is fitted to a clean regime
 that is found automatically; regimes of the operating space are flagged by a calibrated statistic of their residuals'
@@ -25,16 +25,16 @@ _MOST_TERMS = 3
 
 
 def answer(problem: Problem, rng: np.random.Generator, form: Form = "whitened", local: bool = False) -> Answer:
-    """Localise, select, confirm. local: the matrix is that of the clean regime, and terms are those of the flagged one.
+    """Localise, select, confirm. local: terms are selected over the flagged regimes alone, and none where none is.
 
-    Otherwise the matrix is fitted together with the terms, over all rows, as effects that act everywhere want it.
+    Otherwise they are selected over all rows, as effects that act everywhere want it.
     """
     regression = problem.regression(form)
-    flagged, rows = _flagged(problem, regression)
-    if not flagged.any():
-        return NOTHING
-    if not local:
-        rows = np.ones(len(rows), dtype=bool)
+    rows = np.ones(len(regression.target), dtype=bool)
+    if local:
+        flagged, rows = _flagged(problem, regression)
+        if not flagged.any():
+            return NOTHING
     # Thirds of the runs: to fit, to select, to test
     part = rng.permutation(np.arange(regression.run.max() + 1) % 3)[regression.run]
     fitting, selecting, testing = (regression.products_of(rows & (part == number)) for number in range(3))

@@ -11,7 +11,7 @@ standard errors of the noise, is the largest within one standard error of the le
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from pysindy import STLSQ
@@ -25,41 +25,57 @@ _THRESHOLDS = (4.0, 6.0, 9.0, 13.0)
 
 
 def answer(
-    problem: Problem,
-    rng: np.random.Generator,
-    form: Form = "whitened",
-    alpha: float = 0.05,
-    bags: int = 10,
-    *,
-    catalogue: bool = False,
+    problem: Problem, rng: np.random.Generator, form: Form = "whitened", alpha: float = 0.05, bags: int = 10
 ) -> Answer:
-    """Choose terms. alpha: of the ridge. bags: bootstraps. catalogue: the library holds no generic functions."""
+    """Choose terms. alpha: of the ridge. bags: bootstraps.
+
+    The library is the catalogue alone or with all generic functions, whichever predicts held-out runs better.
+    """
     regression = problem.regression(form)
-    groups = [group for group in problem.groups if group.effect is not None or not catalogue]
-    used = [column for group in groups for column in group.index]
-    blocks = regression.blocks(_BLOCKS, rng)[:, [*used, -1]][:, :, [*used, -1]]
-    folds = np.arange(_BLOCKS) % _FOLDS
-    every = list(range(len(used)))
-    gains = np.empty((len(_THRESHOLDS), _FOLDS))
-    for number, threshold in enumerate(_THRESHOLDS):
-        for fold in range(_FOLDS):
-            values = _stlsq(blocks[folds != fold].sum(axis=0), threshold, alpha)
-            held_out = blocks[folds == fold].sum(axis=0)
-            gains[number, fold] = held_out[-1, -1] - held_out_squares(held_out, every, values)
-    means, errors = gains.mean(axis=1), gains.std(axis=1, ddof=1) / np.sqrt(_FOLDS)
-    best = int(means.argmax())
-    if means[best] < 2 * errors[best]:
+    blocks = regression.blocks(_BLOCKS, rng)
+    named = [column for group in problem.groups if group.effect is not None for column in group.index]
+    fits = [_Library.of(blocks, used, alpha) for used in (named, list(range(blocks.shape[1] - 1)))]
+    best = max(fits, key=lambda each: each.gain)
+    if best.gain < 2 * best.error:
         return NOTHING
-    threshold = max(size for size, mean in zip(_THRESHOLDS, means, strict=True) if mean >= means[best] - errors[best])
-    support = np.flatnonzero(_stlsq(blocks.sum(axis=0), threshold, alpha))
     counts: dict[str, float] = {}
     for _ in range(bags):
-        bag = rng.multinomial(_BLOCKS, np.full(_BLOCKS, 1 / _BLOCKS))
-        chosen = {used[column] for column in np.flatnonzero(_stlsq(np.tensordot(bag, blocks, 1), threshold, alpha))}
-        for name in {group.name for group in groups if group.effect is not None and chosen & set(group.index)}:
+        bag = np.tensordot(rng.multinomial(_BLOCKS, np.full(_BLOCKS, 1 / _BLOCKS)), blocks, 1)
+        chosen = set(best.chosen(bag, alpha))
+        for name in {group.name for group in problem.groups if group.effect is not None and chosen & set(group.index)}:
             counts[name] = counts.get(name, 0.0) + 1 / bags
-    confidence: Mapping[str, float] = counts
-    return problem.linear_answer(regression, [used[column] for column in support], confidence)
+    return problem.linear_answer(regression, best.chosen(blocks.sum(axis=0), alpha), counts)
+
+
+@dataclass(frozen=True)
+class _Library:
+    """Some columns, with the threshold chosen by held-out runs, and what these gain, with its standard error."""
+
+    used: list[int]
+    threshold: float
+    gain: float
+    error: float
+
+    @classmethod
+    def of(cls, blocks: Array, used: list[int], alpha: float) -> _Library:
+        of_library = blocks[:, [*used, -1]][:, :, [*used, -1]]
+        folds, every = np.arange(_BLOCKS) % _FOLDS, list(range(len(used)))
+        gains = np.empty((len(_THRESHOLDS), _FOLDS))
+        for number, threshold in enumerate(_THRESHOLDS):
+            for fold in range(_FOLDS):
+                values = _stlsq(of_library[folds != fold].sum(axis=0), threshold, alpha)
+                held_out = of_library[folds == fold].sum(axis=0)
+                gains[number, fold] = held_out[-1, -1] - held_out_squares(held_out, every, values)
+        means, errors = gains.mean(axis=1), gains.std(axis=1, ddof=1) / np.sqrt(_FOLDS)
+        best = int(means.argmax())
+        near = means >= means[best] - errors[best]
+        threshold = max(size for size, is_near in zip(_THRESHOLDS, near, strict=True) if is_near)
+        return cls(used, threshold, float(means[best]), float(errors[best]))
+
+    def chosen(self, products: Array, alpha: float) -> list[int]:
+        """Columns that are left over rows with these products."""
+        values = _stlsq(products[np.ix_([*self.used, -1], [*self.used, -1])], self.threshold, alpha)
+        return [self.used[column] for column in np.flatnonzero(values)]
 
 
 def _stlsq(products: Array, threshold: float, alpha: float) -> Array:
