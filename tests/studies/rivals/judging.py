@@ -6,6 +6,7 @@ import importlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from hidden.disturbances import NULL_KINDS, VALIDATION, scaled
 from hidden.forms import FORMS
 from hidden.judging import CONFIDENT
 from hidden.sets import Truth, make_set
-from hidden.signature import projected
+from hidden.signature import Sight, projected
 from hidden.tasks import Task
 
 from omnibench.config import Model
@@ -22,6 +23,7 @@ from omnibench.fit.noise import Whitener
 from omnibench.processes import one_thread
 from omnibench.progress import Reporter
 from omnibench.registry import effects
+from omnibench.robot.kinematics import Array
 
 from .problem import Answer, Problem, commands_of_kinds, make_problem
 
@@ -51,7 +53,7 @@ RIVALS: dict[str, Rival] = {
     "symbolic": Rival("symbolic regression (pyoperon)", "symbolic", {}, {"bags": 0}),
     "gaussian": Rival("Gaussian process discrepancy", "gaussian"),
     "lisdd": Rival("localise, select, F test (LISDD)", "lisdd", {"local": False}),
-    "lisdd_local": Rival("LISDD, matrix of the clean regime", "lisdd", {"local": True}),
+    "lisdd_local": Rival("LISDD, in flagged regimes alone", "lisdd", {"local": True}),
 }
 
 
@@ -161,13 +163,20 @@ def _closed(answer: Answer, truth: Truth, problem: Problem, runs: Sequence[Traje
     return 1 - after / before
 
 
+@lru_cache(maxsize=1)  # all rivals are judged on one set after the other
+def _seen(truth: Truth) -> tuple[Sight, Array]:
+    """How effects are seen in a set's training runs, and the whitened signature of what is hidden."""
+    sight = truth.sight()
+    return sight, truth.signature(sight)
+
+
 def _parameter_error(answer: Answer, truth: Truth) -> float | None:
     """Length of the error of the first name's parameters over that of the projection of what is hidden onto it."""
     if truth.kind != "single" or not answer.values:
         return None
-    hidden, sight = truth.hidden[0], truth.sight()
+    hidden, (sight, signature) = truth.hidden[0], _seen(truth)
     shapes = {name: answer.values.get(name, hidden.values[name]) for name in hidden.values}
-    true, _ = projected(sight, FORMS[hidden.name], shapes, truth.signature(sight))
+    true, _ = projected(sight, FORMS[hidden.name], shapes, signature)
     known = [name for name in FORMS[hidden.name].plausible if name in answer.values]
     errors = np.array([answer.values[name] - true[name] for name in known])
     return float(np.linalg.norm(errors) / np.linalg.norm([true[name] for name in known])) if known else None

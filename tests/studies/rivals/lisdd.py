@@ -1,12 +1,13 @@
 """LISDD (Y. Wang, "Where is my physics wrong?", arXiv 2606.23215, 2026), from its abstract; no code was at hand.
 
-Localised, identifiable sparse discovery of discrepancy: the known physics (here the matrix) is fitted to a clean regime
-that is found automatically; regimes of the operating space are flagged by a calibrated statistic of their residuals'
-energy; the missing term is selected there by exhaustive hold-out over the library, and confirmed by an F test on a part
-of the data that selection has not seen; Benjamini and Hochberg's procedure controls false discoveries.
+Localised, identifiable sparse discovery of discrepancy: the known physics is fitted to a clean regime that is found
+automatically; regimes of the operating space are flagged by a calibrated statistic of their residuals' energy; the
+missing term is selected there by exhaustive hold-out over the library, and confirmed by an F test on a part of the data
+that selection has not seen; Benjamini and Hochberg's procedure controls false discoveries.
 
 Not in the abstract, and so chosen: regimes are quarters of a covariate's range, and single commands; the clean regime
-is the half of the commands with least energy; further terms are selected until one is not confirmed.
+is the half of the commands with least energy; further terms are selected until one is not confirmed. Otherwise than
+there, the known physics, here the matrix, is fitted beside the terms over all rows: few commands do not determine it.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ def _flagged(problem: Problem, regression: Regression) -> tuple[NDArray[np.bool_
     windows = problem.windows(None, 1e-3)  # one an interval
     starts = np.flatnonzero(np.diff(windows.run, prepend=-1))
     window = starts[regression.run] + regression.stamp
-    commands = np.array([hash(run.command) for run in problem.plain.runs])[regression.run]
+    names = [run.command or run.id for run in problem.plain.runs]
+    commands = np.unique(names, return_inverse=True)[1][regression.run]
     energy: Array = regression.target**2
     of_command = {name: energy[commands == name].mean() for name in np.unique(commands).tolist()}
     limit = float(np.median(list(of_command.values())))

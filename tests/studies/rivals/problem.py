@@ -37,6 +37,7 @@ Changes = Callable[[Sequence[Trajectory]], list[Array]]
 _ABSORBED = 0.02  # share of itself that an effect must keep beyond the matrix to be a candidate
 _HARMONICS = (0.5, 2.0)  # of the wheel angle, beside eccentricity and 3 to 16 rollers
 _WINDOW = 1.5  # s, of the weak form; chosen
+_HALF = 0.5  # share of a function's signature that an effect must explain to be its name; chosen
 _PART = 0.2  # share of what is explained that makes a term one of the answer; chosen
 
 
@@ -247,11 +248,11 @@ class Problem:
             jacobians = at_runs(self.plain, runs).matrix_jacobian()
             return [change + jacobian @ elements for change, jacobian in zip(of_terms, jacobians, strict=True)]
 
-        covariates = frozenset(self.shown_in(key) for key in parts)
+        covariates = frozenset(self._shown_in(key) for key in parts)
         return Answer(names, not parts[0][0], covariates, numbers, changes)
 
     @staticmethod
-    def shown_in(key: tuple[bool, str]) -> str:
+    def _shown_in(key: tuple[bool, str]) -> str:
         """The covariate of an effect, or of generic functions, which are called by theirs."""
         return effects.create(key[1]).shows_in if key[0] else key[1]
 
@@ -340,9 +341,9 @@ class Problem:
             return NOTHING
         products = np.vstack([regression.products[:-1], np.append(made @ regression.columns, whole)])
         products[:, -1] = products[-1]
-        effects_of = [group for group in self.groups if group.effect is not None]
-        shares = [(solved(products, group.index)[1] / whole, group.name) for group in effects_of]
-        share, name = max(shares)
+        named = [(solved(products, group.index), group) for group in self.groups if group.effect is not None]
+        (numbers, explained), best = max(named, key=lambda pair: pair[0][1])
+        share = explained / whole
         elements = of_matrix[:, 1] - of_matrix[:, 0]
 
         def changes(runs: Sequence[Trajectory]) -> list[Array]:
@@ -351,13 +352,10 @@ class Problem:
             pairs = zip(windows.response(twists_of(windows)), jacobians, strict=True)
             return [change + jacobian @ elements for change, jacobian in pairs]
 
-        best = next(
-            group for group in effects_of if group.name == name and (solved(products, group.index)[1] / whole) == share
-        )
-        values = dict(zip((each.name for each in best.parameters), solved(products, best.index)[0], strict=True))
-        if share < 0.5:
+        if share < _HALF:
             return Answer((), sure >= 0.5, covariates, {}, changes)
-        return Answer(((name, share * sure),), False, covariates, values | dict(best.shapes), changes)
+        values = dict(zip((each.name for each in best.parameters), numbers, strict=True)) | dict(best.shapes)
+        return Answer(((best.name, share * sure),), False, covariates, values, changes)
 
 
 def _windows_of(stamps: Array) -> Array:
