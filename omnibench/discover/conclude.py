@@ -303,6 +303,7 @@ def _calibration_of(
         **choices,
     }
     robot, matrix, covariance = dataset.robot, extended.fit.model.matrix, extended.covariance_of_terms
+    driven = tuple(tuple(float(value) for value in motion) for motion in validating.training_domain(extended))
     reading = read_matrix(robot, matrix, covariance, effects=terms, fitted_mount=default_mount(robot) == "fit")
     calibration = calibration_of_fit(
         f"{dataset.name} {name}",
@@ -315,7 +316,7 @@ def _calibration_of(
         parameters={each.name: each for each in reading.parameters},
         covariance=covariance_rows(covariance),
         session=extended.fit.runs[0].session,
-        driven=tuple(tuple(float(value) for value in motion) for motion in validating.training_domain(extended)),
+        driven=driven if plain is None or extended.fit.model.fade is not None else None,
         plain=matrix_rows(plain.fit.model.matrix) if plain is not None and terms else None,
     )
     with suppress(DataError):  # runs may lack what an effect needs: no slip then

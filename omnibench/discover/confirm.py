@@ -83,8 +83,8 @@ class Confirmed:
     screening, models: what the effects were selected by with the noise that they leave, and the models with them.
     effects: those with a name. where, left: what the residuals depend on without effects and beside all that the model
     in use holds. average: of the estimates of the competing models, of which ``likeliest`` is one. baseline, extended:
-    the plain matrix, and the average, which fades outside the training domain, under the same noise. folds (Z,): in
-    which each run was held out. notes: on terms without a name.
+    the plain matrix, and the average, which fades outside the training domain where it is doubtful, under the same
+    noise. folds (Z,): in which each run was held out. notes: on terms without a name.
     """
 
     selected: Selected
@@ -159,6 +159,8 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
             average = AveragedModel(baseline, ((1.0, baseline),))
     if explained:
         models = replace(models, used=estimates[0][1])
+    # Where models disagree, or functions have no physics, they are not followed to motions that were not driven
+    doubtful = len(average.members) > 1 or any(group.basis is not None for group in average.extended.groups)
     return Confirmed(
         selected=selected,
         screening=screening,
@@ -169,7 +171,7 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
         average=average,
         likeliest=estimates[0][1],
         baseline=baseline,
-        extended=faded(average.extended, baseline),
+        extended=faded(average.extended, baseline) if doubtful else average.extended,
         folds=folds,
         notes=notes,
     )

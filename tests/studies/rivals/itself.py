@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from omnibench.data.dataset import Trajectory
-from omnibench.discover.discover import discover_effects, lacks_a_name
+from omnibench.discover.discover import discover_effects
+from omnibench.discover.result import lacks_a_name
 from omnibench.registry import effects
 from omnibench.robot.kinematics import Array
 

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory, make_dataset
-from omnibench.discover.fitting import Fit, at_runs, fit_matrix, paths_of
-from omnibench.discover.regressors.paths import Paths, slopes_by
-from omnibench.discover.regressors.significance import Group
-from omnibench.discover.selection.model_selection import Screening, screen_plain
+from omnibench.discover.fit import Fit, at_runs, fit_matrix, paths_of
+from omnibench.discover.paths import Paths, slopes_by
+from omnibench.discover.screening import Screening, make_groups, screen
+from omnibench.discover.significance import Group
 from omnibench.fit.trajectory_fit import usable_runs
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect
@@ -149,12 +149,12 @@ class Problem:
 
     @cached_property
     def screening(self) -> Screening:
-        return screen_plain(self.plain, ())
+        return screen(self.plain, self.plain.nuisance_free_residuals, make_groups(self.plain, ()))
 
     @cached_property
     def library(self) -> tuple[Group, ...]:
         """Candidates; ``index`` counts the columns of a regression."""
-        groups, given = self.screening.groups, self.screening.beyond_matrix()
+        groups, given = self.screening.groups, self.screening.beyond_matrix
         chosen = [group for group in groups.effects if given.share_left(group.index) > _ABSORBED]
         chosen += [
             group
