@@ -21,10 +21,11 @@ from omnibench.data.dataset import Dataset, Trajectory
 from omnibench.data.recording_options import RobotOption
 from omnibench.data.splits import training_split
 from omnibench.data.storage import load_dataset
-from omnibench.design.d_optimality import Counts
+from omnibench.design.exchange import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
-from omnibench.fit.identifiability import identifiability
-from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
+from omnibench.fit.identifiability import identifiability, kept_motions
+from omnibench.fit.span import driven_span
+from omnibench.report.numbers import fixed, noise_in_words, significant
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
@@ -158,6 +159,8 @@ Use = Literal["final", "trajectory"]
 Per = Literal["run", "second", "metre"]
 """Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
 
+_WAYS = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}  # deg
+
 
 @dataclass(frozen=True, eq=False)
 class CandidateRun:
@@ -170,6 +173,45 @@ class CandidateRun:
     def duration(self) -> float:
         """The mean duration of the command's runs, s."""
         return float(np.mean([run.pose_times[-1] for run in self.runs]))
+
+    @property
+    def distance(self) -> float:
+        """The way of the robot's centre, m: as commanded, or else along the reference poses."""
+        if self.runs[0].distance is not None:
+            return self.runs[0].distance
+        return float(np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in self.runs]))
+
+    @property
+    def in_words(self) -> str:
+        """The command as a person drives it: ``forward 2 m at 0.5 m/s, turning left by 90° with radius 1.2 m``."""
+        speed, direction, rate = self.runs[0].v, self.runs[0].alpha, self.runs[0].omega
+        if speed is None or direction is None or rate is None:
+            return self.name
+        turned = math.degrees(abs(rate) * (self.distance / speed if speed else self.duration))
+        turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
+        side = "left" if rate > 0 else "right"
+        if not speed:
+            return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
+        degrees = round(math.degrees(direction), 3) % 360
+        aside = f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {'left' if degrees < 180 else 'right'} of forward,"
+        length = f"{significant(self.distance, 2)} m at {significant(speed, 2)} m/s"
+        turning = f", turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m" if rate else ""
+        return f"{_WAYS.get(degrees, aside)} {length}{turning}"
+
+
+@dataclass(frozen=True, eq=False)
+class CommandedRun(CandidateRun):
+    """A command with its one run at the design values. heading: at its start, deg; None: any."""
+
+    timed: TimedCommand
+    heading: float | None = None
+
+    @property
+    def in_words(self) -> str:
+        variation = self.timed.variation
+        heading = "" if self.heading is None else f", from a heading of {self.heading:.0f}°"
+        weave = f", weaving by {variation.weave:g} rad/s every {variation.period:g} s" if variation.weave else ""
+        return f"{super().in_words}{heading}{weave}{', turning back halfway' if variation.reversals else ''}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +226,14 @@ class CandidatePool:
     name: str
     robot: Robot
     integration: Integration
-    baseline_name: str
     noise: Noise
     noise_source: str
     description: str = ""
     notes: tuple[str, ...] = ()
-    candidates: tuple[CandidateRun, ...] = ()
-    sets: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    candidates: Sequence[CandidateRun] = ()
+    sets: Mapping[str, Sequence[int]] = field(default_factory=dict)
     baseline: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    baseline_name: str = ""
     simulated: bool = True
     recorded: bool = False
 
@@ -199,50 +241,133 @@ class CandidatePool:
         self,
         periods: tuple[float, float],
         sets: Mapping[str, Sequence[TimedCommand]],
+        baseline: str,
         driven: Mapping[TimedCommand, int],
     ) -> CandidatePool:
         """The pool with candidates of sets of commands, each with the one run of a robot that is exactly as designed.
 
-        periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
-        ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
+        periods: of the wheel samples and of the reference poses, s. baseline: name of the set whose commands it drives,
+        and how often each. ConfigError: a set leaves part of the matrix undetermined, or has one command; no noise.
         """
-        place = self.source
         if _noiseless(self.noise):
-            raise ConfigError(f"{place}: noise: give position and heading some; without it, runs cannot be weighed")
-        commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
-        places = {timed: index for index, timed in enumerate(commands)}
+            raise ConfigError(f"{self.source}: noise: give position and heading some; runs are weighed by it")
         model = OdometryModel.of_design(self.robot, self.integration)
-        names = Counter(timed.command.name for timed in commands)
-        candidates = []
+        commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
+        same_names = Counter(timed.command.name for timed in commands)
+        candidates = {}
         for timed in commands:
-            title = timed.command.name
-            title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
-            candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
-        indices = {of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()}
-        for of_set, chosen in indices.items():
-            if len(chosen) == 1:
-                raise ConfigError(f"{place}: {of_set}: it has one command only; a design needs several to choose from")
-            runs = [run for index in chosen for run in candidates[index].runs]
-            require_every_motion(self.robot, runs, f"{place}: {of_set}", ConfigError)
-        baseline = np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp)
-        return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
+            ending = f"_t{timed.duration:.4g}" if same_names[timed.command.name] > 1 else ""
+            name = timed.command.name + ending
+            candidates[timed] = CommandedRun(name, (run_as_designed(model, timed, periods, name),), timed)
+        for name, of_set in sets.items():
+            if len(of_set) == 1:
+                raise ConfigError(f"{self.source}: {name}: it has one command only; give several to choose from")
+            runs = [run for timed in of_set for run in candidates[timed].runs]
+            require_every_motion(self.robot, runs, f"{self.source}: {name}", ConfigError)
+        places = {timed: place for place, timed in enumerate(commands)}
+        numbers = {*driven.values()}
+        often = f" x {numbers.pop()}" if len(numbers) == 1 else f", {plural(sum(driven.values()), 'run')}"
+        return replace(
+            self,
+            candidates=tuple(candidates.values()),
+            sets={name: [places[timed] for timed in of_set] for name, of_set in sets.items()},
+            baseline=np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp),
+            baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {baseline}{often}",
+        )
 
 
 # Shapes of the runs that are offered; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
-# deg, m, deg: more is a slip of the pen.
-_MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"
 _SET = "robot"  # name of the candidates' set
 _SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
 # of the recordings that omnibench was tried on, 3 to 9 mm.
-ASSUMED_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
+_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
 
 
-_OF_ROBOTS = (
-    "max_speed", "max_turn_rate", "max_wheel_rate", "steering_limit", "area", "position_noise", "heading_noise"
-)  # fmt: skip
+class RobotFile(Model):
+    """A robot without recordings: robot as in dataset.yaml, or a file that holds one."""
+
+    robot: RobotOption
+
+
+class RobotLimits(Model):
+    """What a robot without recordings may drive, and how well it will be seen; None: the default."""
+
+    max_speed: Positive | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
+    max_turn_rate: Positive | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
+    max_wheel_rate: Positive | None = Field(
+        None, description="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
+    )
+    steering_limit: float | None = Field(
+        None,
+        gt=0,
+        le=180,
+        description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90.",
+    )
+    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
+    position_noise: float | None = Field(
+        None, gt=0, lt=10, description="With --robot: of the reference's positions, m. Default: 0.005."
+    )
+    heading_noise: float | None = Field(
+        None, gt=0, lt=90, description="With --robot: of the reference's headings, deg. Default: 0.3."
+    )
+
+    def pool(self, robot: Robot, source: str, integration: Integration = "arc") -> CandidatePool:
+        """Lines, arcs to both sides and turns on the spot, as fast as the limits allow; the baseline drives each once.
+
+        ConfigError: limits that exclude each other or every curve; the commands leave part of the matrix undetermined.
+        """
+        speed, rate = self.max_speed or 0.5, self.max_turn_rate or 1.0
+        limit = motion.steering_limit(robot, self.steering_limit)
+        if self.steering_limit is not None and robot.drive.direct:
+            raise ConfigError(f"{source}: --steering-limit: no wheel of this robot steers; leave it out")
+        # Largest wheel rates straight on at the greatest speed, in each direction that the robot drives
+        twists = [Command(speed, math.radians(way), 0.0).twist for way in motion.default_directions(robot)]
+        rates = [float(np.abs(motion.wheels_of(robot, twist)[0]).max()) for twist in twists]
+        wheel_rate = self.max_wheel_rate or max(rates)
+        if wheel_rate < (1 - 1e-9) * min(rates):
+            fastest = math.floor(1000 * speed * wheel_rate / min(rates)) / 1000
+            raise ConfigError(
+                f"{source}: --max-speed {speed:g}: at --max-wheel-rate {wheel_rate:g} rad/s the wheels drive at most "
+                f"{fastest:g} m/s; give no more, or raise the wheels' rate"
+            )
+        sides = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", self.area or "3x3")
+        wide, deep = map(float, sides.groups()) if sides else (0.0, 0.0)
+        if not 0 < min(wide, deep) <= max(wide, deep) < math.inf:
+            raise ConfigError(f"--area {self.area}: give two sides in m, like --area 3x2.5")
+        half_width = max(math.hypot(*wheel.position) + wheel.radius for wheel in robot.wheels)
+        free, floor = (wide - 2 * half_width, deep - 2 * half_width), f"{wide:g} x {deep:g} m"
+        if min(free) < 2 * motion.SHORTEST:
+            least = math.ceil(20 * (half_width + motion.SHORTEST)) / 10
+            raise ConfigError(
+                f"{source}: --area {wide:g}x{deep:g}: the robot alone takes {2 * half_width:.2g} m; give both sides at "
+                f"least {least:g} m"
+            )
+        commands = tuple(dict.fromkeys(motion.DrivableCommands(robot, speed, rate, wheel_rate, limit, free, _SHAPES)))
+        if not any(timed.command.turn_rate for timed in commands):
+            raise ConfigError(
+                f"{source}: no curve that it can drive within {motion.LONGEST:g} s fits an area of {floor}; give a "
+                "larger --area, or a greater --steering-limit or --max-speed"
+            )
+        steering = "" if robot.drive.direct else f", steering angles {math.degrees(limit):g} deg"
+        sizes = {"pose_position": self.position_noise, "pose_heading": math.radians(self.heading_noise or 0.0)}
+        noise = _NOISE.model_copy(update={name: size for name, size in sizes.items() if size})
+        return CandidatePool(
+            source,
+            robot.name or "robot",
+            robot,
+            integration,
+            noise,
+            noise_source="assumed: positions {}, headings {}".format(*noise_in_words(noise)),
+            description="What to drive before anything was recorded.",
+            notes=(
+                f"Commands were made for at most {speed:g} m/s, {rate:g} rad/s, wheels {wheel_rate:.3g} rad/s"
+                f"{steering}, and a free floor of {floor}, of which its wheels need {half_width:.2g} m.",
+                "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
+            ),
+        ).commanded((_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands}, _SET, dict.fromkeys(commands, 1))
 
 
 class DesignRequest(Model):
@@ -262,21 +387,7 @@ class DesignRequest(Model):
     robot: Path | None = Field(
         None, description="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."
     )
-    max_speed: float | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
-    max_turn_rate: float | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
-    max_wheel_rate: float | None = Field(
-        None, description="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
-    )
-    steering_limit: float | None = Field(
-        None, description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
-    )
-    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
-    position_noise: float | None = Field(
-        None, description="With --robot: of the reference's positions, m. Default: 0.005."
-    )
-    heading_noise: float | None = Field(
-        None, description="With --robot: of the reference's headings, deg. Default: 0.3."
-    )
+    limits: RobotLimits = RobotLimits()
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -288,132 +399,17 @@ class DesignRequest(Model):
 
         ConfigError in one line: both or neither are given, options that go with the other, or a value that cannot be.
         """
-        robot = self.robot
-        given: dict[str, Any] = self.model_dump(include=set(_OF_ROBOTS), exclude_none=True)
-        for name, value in given.items():
-            option = f"--{name.replace('_', '-')}"
-            if robot is None:
-                raise ConfigError(f"{option}: is for --robot FILE, a design without a recording")
-            if name != "area" and not 0 < value < _MOST.get(name, math.inf):
-                below = f" and below {_MOST[name]:g}" if name in _MOST else ""
-                raise ConfigError(f"{option} {value:g}: must be above 0{below}")
-        if robot is None:
-            if self.source is None:
-                raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
-            return self.source
-        if self.source is not None:
-            raise ConfigError(f"--robot {robot}: designs without {self.source}; give one of them")
-        refuse_choice(self.dataset, robot)
-        noise = ASSUMED_NOISE.model_dump()
-        noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
-        noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
-        if "area" in given:
-            text = given["area"]  # the sides, m, like 3x2.5
-            match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
-            given["area"] = sides = tuple(map(float, match.groups())) if match else (0.0, 0.0)
-            if min(sides) <= 0 or not math.isfinite(max(sides)):
-                raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
-        if "steering_limit" in given:
-            given["steering_limit_deg"] = given.pop("steering_limit")
-        content = {"robot": str(robot), "noise": noise, **given}
-        commands = validate(RobotCommands, content, f"design --robot {robot}")
-        return commands.pool(str(robot), self.integration or "arc")
-
-
-class RobotCommands(Model):
-    """A robot without recordings, and what it may drive.
-
-    Without ``max_wheel_rate`` no wheel turns faster than it does straight on at ``max_speed``.
-    """
-
-    robot: RobotOption
-    max_speed: Positive = Field(0.5, description="m/s")
-    max_turn_rate: Positive = Field(1.0, description="rad/s")
-    max_wheel_rate: Positive | None = Field(None, description="rad/s")
-    area: tuple[Positive, Positive] = Field((3.0, 3.0), description="free floor, m")
-    steering_limit_deg: float | None = Field(None, gt=0, le=180, description="degrees; default: by the type of robot")
-    noise: Noise = ASSUMED_NOISE
-
-    @model_validator(mode="after")
-    def _can_be_driven(self) -> RobotCommands:
-        if self.steering_limit_deg is not None and self.robot.drive.direct:
-            raise ValueError("--steering-limit: no wheel of this robot steers; leave it out")
-        fastest = self.max_speed * self._wheel_rate / min(self._straight_rates)
-        if fastest < (1 - 1e-9) * self.max_speed:
-            raise ValueError(
-                f"--max-speed {self.max_speed:g}: at --max-wheel-rate {self._wheel_rate:g} rad/s the wheels drive at "
-                f"most {math.floor(1000 * fastest) / 1000:g} m/s; give no more, or raise the wheels' rate"
-            )
-        if min(self._free) < 2 * motion.SHORTEST:
-            need = 2 * (self._half_width + motion.SHORTEST)
-            raise ValueError(
-                f"--area {self.area[0]:g}x{self.area[1]:g}: the robot alone takes {2 * self._half_width:.2g} m; give "
-                f"both sides at least {math.ceil(10 * need) / 10:g} m"
-            )
-        return self
-
-    def pool(self, source: str, integration: Integration = "arc") -> CandidatePool:
-        """The candidates of a design, each of which the baseline drives once.
-
-        source: for messages. ConfigError: the commands leave part of the matrix undetermined.
-        """
-        # Lines, arcs to both sides and turns on the spot, each as fast as the limits allow.
-        robot, limit, noise = self.robot, motion.steering_limit(self.robot, self.steering_limit_deg), self.noise
-        drivable = motion.DrivableCommands(
-            robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, self._free, _SHAPES
-        )
-        commands = tuple(dict.fromkeys(drivable))
-        floor = f"{self.area[0]:g} x {self.area[1]:g} m"
-        if not any(timed.command.turn_rate for timed in commands):
-            raise ConfigError(
-                f"{source}: no curve that it can drive within {motion.LONGEST:g} s fits an area of {floor}; give a "
-                "larger --area, or a greater --steering-limit or --max-speed"
-            )
-        words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
-        if not robot.drive.direct:
-            words.append(f"steering angles {math.degrees(limit):g} deg")
-        pool = CandidatePool(
-            source,
-            robot.name or "robot",
-            robot,
-            integration,
-            baseline_name=f"all {plural(len(commands), 'command')} once",
-            noise=noise,
-            noise_source=(
-                f"assumed: {1000 * noise.pose_position:.3g} mm and {math.degrees(noise.pose_heading):.2g} deg of "
-                f"each reference pose, {1000 * noise.walk_position:.3g} mm and "
-                f"{math.degrees(noise.walk_heading):.2g} deg per √s of floor and slip"
-            ),
-            description="What to drive before anything was recorded.",
-            notes=(
-                f"Commands were made for at most {', '.join(words)}, and a free floor of {floor}, of which the robot's "
-                f"wheels need {self._half_width:.2g} m about its centre.",
-                "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
-            ),
-        )
-        return pool.commanded((_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands}, dict.fromkeys(commands, 1))
-
-    @property
-    def _straight_rates(self) -> list[float]:
-        """Largest wheel rates, rad/s, straight on at the greatest speed, in each direction that the robot drives."""
-        directions = map(math.radians, motion.default_directions(self.robot))
-        twists = [Command(self.max_speed, direction, 0.0).twist for direction in directions]
-        return [float(np.abs(motion.wheels_of(self.robot, twist)[0]).max()) for twist in twists]
-
-    @property
-    def _wheel_rate(self) -> float:
-        return self.max_wheel_rate or max(self._straight_rates)
-
-    @property
-    def _half_width(self) -> float:
-        """The farthest that a wheel reaches from the centre, m."""
-        return max(math.hypot(*wheel.position) + wheel.radius for wheel in self.robot.wheels)
-
-    @property
-    def _free(self) -> tuple[float, float]:
-        """Sides, m, of the area that the robot's centre may be in."""
-        wide, deep = (side - 2 * self._half_width for side in self.area)
-        return wide, deep
+        if self.robot is not None:
+            if self.source is not None:
+                raise ConfigError(f"--robot {self.robot}: designs without {self.source}; give one of them")
+            refuse_choice(self.dataset, self.robot)
+            robot = validate(RobotFile, {"robot": str(self.robot)}, f"design --robot {self.robot}").robot
+            return self.limits.pool(robot, str(self.robot), self.integration or "arc")
+        for name in self.limits.model_dump(exclude_none=True):
+            raise ConfigError(f"--{name.replace('_', '-')}: is for --robot FILE, a design without a recording")
+        if self.source is None:
+            raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
+        return self.source
 
 
 def read_candidates(
@@ -437,9 +433,8 @@ def read_candidates(
         return _candidates_of_comparison(compared, dataset, integration, str(path))
     refuse_choice(dataset, path)
     config = validate(DesignConfig, content, str(path))
-    return candidates_of_config(
-        config if integration is None else config.model_copy(update={"integration": integration}), str(path)
-    )
+    chosen = integration or config.integration
+    return candidates_of_config(config.model_copy(update={"integration": chosen}), str(path))
 
 
 def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", source: str = "") -> CandidatePool:
@@ -496,21 +491,22 @@ def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePoo
 
     ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
     """
-    commands = {name: config.commands(name) for name in config.sets}
-    baseline, count = config.baseline, len(commands[config.baseline.set])
-    pool = CandidatePool(
+    commands, baseline = {name: config.commands(name) for name in config.sets}, config.baseline
+    return CandidatePool(
         source or f"config {config.name}",
         config.name,
         config.robot,
         config.integration,
-        baseline_name=f"{count} {noun_for(count, 'command')} of {baseline.set} x {baseline.repetitions}",
-        noise=config.noise,
+        config.noise,
         noise_source="assumed: as the config says",
         description=config.description,
         notes=config.notes,
+    ).commanded(
+        (config.sample_period, config.pose_period),
+        commands,
+        baseline.set,
+        dict.fromkeys(commands[baseline.set], baseline.repetitions),
     )
-    driven = dict.fromkeys(commands[baseline.set], baseline.repetitions)
-    return pool.commanded((config.sample_period, config.pose_period), commands, driven)
 
 
 def _candidates_of_comparison(
@@ -534,20 +530,15 @@ def _candidates_of_comparison(
     driven = Counter[TimedCommand]()
     for planned in flower.planned(flower.train):
         driven[planned.timed] += planned.repetitions
-    times = {*driven.values()}
-    often = f" x {times.pop()}" if len(times) == 1 else f", {plural(driven.total(), 'run')}"
-    scale = flower.train.noise_scale
-    pool = CandidatePool(
+    return CandidatePool(
         place,
         name,
         flower.robot,
         chosen,
-        baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {name}{often}",
-        noise=Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
+        Noise(**{kind: flower.train.noise_scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
         noise_source="assumed: what the config simulates for training",
         notes=config.notes,
-    )
-    return pool.commanded((flower.sample_period, flower.pose_period), {name: tuple(driven)}, driven)
+    ).commanded((flower.sample_period, flower.pose_period), {name: tuple(driven)}, name, driven)
 
 
 def _noiseless(noise: Noise) -> bool:
@@ -560,19 +551,11 @@ def _noiseless(noise: Noise) -> bool:
 
 def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, error: type[OmnibenchError]) -> None:
     """Raise ``error`` where runs leave out a motion that the robot can make, whose part of the matrix stays unknown."""
-    # Signals (M, D) of the robot's motions without slip, orthonormal.
-    possible, _ = np.linalg.qr(robot.signal_equations @ robot.motions.T)
-    count = possible.shape[1]
-    _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((count, count))]))
-    missing = motions[strengths < 0.5] @ possible.T
-    if len(missing):
-        words = [
-            f"{direction_in_words(direction, robot.drive.names)} ({motion_in_words(direction, robot)})"
-            for direction in aligned(missing, robot)
-        ]
+    if missing := kept_motions(robot, driven_span(runs), "matrix", "keep"):
+        words = " nor along ".join(f"{each.words} ({each.motion})" for each in missing)
         raise error(
-            f"{place}: its commands do not drive the wheels along {' nor along '.join(words)}, beyond what slip may "
-            "do, and so cannot identify the matrix there; add commands that do"
+            f"{place}: its commands do not drive the wheels along {words}, beyond what slip may do, and so cannot "
+            "identify the matrix there; add commands that do"
         )
 
 

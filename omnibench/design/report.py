@@ -81,7 +81,10 @@ class DesignResult(Result):
         design = self.design
         tiles, plans, chosen = list[page.Fact](), list[page.Block](), list[page.Block]()
         for of_set in design.sets:
-            effort, equal = of_set.step.effort, of_set.equivalent(design.use).effort
+            effort, equal = (
+                of_set.step.effort,
+                next(each.effort for each in of_set.equivalents if each.use == design.use),
+            )
             share = f"{percent(of_set.step.efficiency, 2)} of the bound; {_duration(effort.seconds)}"
             tiles.append(page.Fact(f"{of_set.name}: chosen", plural(effort.runs, "run"), share))
             baseline = f"{of_set.name}: equal to the baseline's {count(design.baseline.precision.effort.runs)}"
@@ -134,28 +137,9 @@ def command_in_words(candidate: Candidate) -> str:
     return motion_in_words(candidate.name, candidate.speed, candidate.direction, candidate.turn_rate)
 
 
-def _driven(candidate: Candidate) -> str:
-    """A command as a person drives it: ``forward 2 m at 0.5 m/s, turning left by 90° with radius 1.2 m``."""
-    speed, direction, rate = candidate.speed, candidate.direction, candidate.turn_rate
-    if speed is None or direction is None or rate is None:
-        return candidate.name
-    turned = math.degrees(abs(rate) * candidate.duration_s)
-    turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
-    side = "left" if rate > 0 else "right"
-    if not speed:
-        return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
-    degrees = round(math.degrees(direction), 3) % 360
-    aside = f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {'left' if degrees < 180 else 'right'} of forward,"
-    ways = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}
-    length = f"{significant(candidate.distance_m, 2)} m at {significant(speed, 2)} m/s"
-    turning = f", turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m" if rate else ""
-    return f"{ways.get(degrees, aside)} {length}{turning}"
-
-
 def what_to_drive(design: Design, of_set: SetDesign) -> tuple[str, ...]:
     """What to drive of a set, a line for each chosen command, with how often."""
-    drives = ((_driven(design.candidate(chosen.command)), chosen.runs) for chosen in of_set.chosen)
-    return tuple(f"{drive}, {plural(runs, 'time')}" for drive, runs in drives)
+    return tuple(f"{design.candidate(each.command).words}, {plural(each.runs, 'time')}" for each in of_set.chosen)
 
 
 def left_open(of_set: SetDesign) -> str:
