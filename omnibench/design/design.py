@@ -25,6 +25,7 @@ from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.span import direction_in_words, driven_span
 from omnibench.fit.trajectory_fit import Stamps, information_of_runs
+from omnibench.report.numbers import motion_in_words
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot, class_of, relative
 from omnibench.robot.odometry import Integration
@@ -45,6 +46,16 @@ class Candidate(Model):
     path: tuple[tuple[float, float, float], ...] = Field(
         exclude=True, repr=False, description="poses along a run from (0, 0, 0), for drawing: m, m, rad"
     )
+
+    @property
+    def motion(self) -> str:
+        """The command as ``0.2 m/s at 30°, −0.35 rad/s``."""
+        return motion_in_words(self.name, self.speed, self.direction, self.turn_rate)
+
+    @property
+    def turned(self) -> float:
+        """The angle that a run turns by, rad; positive to the left."""
+        return self.path[-1][2] - self.path[0][2]
 
 
 class Effort(Model):
@@ -418,19 +429,16 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
     )
 
 
-def _remarks(pool: CandidatePool, use: Use, per: Per) -> tuple[str, ...]:
+def _remarks(pool: CandidatePool, use: Use, per: Per) -> Iterator[str]:
     """Assumptions behind the numbers."""
     logs = "as recorded" if pool.recorded else "as the design values command them"
-    remarks = [
+    yield (
         f"Information is that of the matrix elements at the robot's design values, with wheel rates {logs} and taken "
-        "as exact; the design is optimal for robots near them.",
-        "It assumes that one matrix is the whole truth. To find what a matrix cannot express (slip, speed or direction "
-        "dependence), drive other commands too.",
-        "Exact designs are found by adding the run that gains most and by exchange, and are local optima; the bound "
-        "says how far from the best they can be.",
-    ]
+        "as exact. It assumes that one matrix is the whole truth: to find what a matrix cannot express (slip, speed or "
+        "direction dependence), drive other commands too."
+    )
+    yield "Exact designs are found by exchange, and are local optima; the bound says how far from the best they can be."
     if per == "run":
-        remarks.append("A run counts as a run however long it is; --per second or --per metre makes long ones dear.")
+        yield "A run counts as a run however long it is; --per second or --per metre makes long ones dear."
     if use == "final":
-        remarks.append("Only the final pose of a run is used, with the same noise in m and rad, as Eq. (6) weighs it.")
-    return tuple(remarks)
+        yield "Only the final pose of a run is used, with the same noise in m and rad, as Eq. (6) weighs it."

@@ -394,17 +394,7 @@ def plan_config(
 ) -> str:
     """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
     between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
-    listed = [
-        ListedCommand(
-            speed=candidate.timed.command.speed,
-            direction_deg=round(math.degrees(candidate.timed.command.direction), 6),
-            turn_rate=round(candidate.timed.command.turn_rate, 4),
-            duration=candidate.timed.duration,
-            repetitions=count,
-            heading_deg=candidate.heading,
-        )
-        for candidate, count in chosen
-    ]
+    listed = [ListedCommand.of(each.timed, repetitions=count, heading_deg=each.heading) for each, count in chosen]
     steered = [run.steering for candidate, _ in chosen for run in candidate.runs if run.steering is not None]
     largest = max((float(np.abs(angles).max(initial=0.0)) for angles in steered), default=None)
     found = [each for each in effects if each.stage != "actuator"]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -239,6 +239,15 @@ class SingleCommand(Model):
     def commands(self, robot: Robot) -> Iterator[TimedCommand]:
         """The one command, as a grid has many. ValueError as for ``command``."""
         yield TimedCommand(self.command(robot), self.duration)
+
+    @classmethod
+    def of(cls, timed: TimedCommand, **fields: Any) -> Self:
+        """A command as a config lists it, its direction as a person writes it. fields: further ones."""
+        command = timed.command
+        degrees = round(math.degrees(command.direction), 6)
+        return cls(
+            speed=command.speed, direction_deg=degrees, turn_rate=command.turn_rate, duration=timed.duration, **fields
+        )
 
 
 class ListedCommand(SingleCommand):
