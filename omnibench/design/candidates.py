@@ -25,7 +25,7 @@ from omnibench.design.exchange import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
 from omnibench.fit.identifiability import identifiability, kept_motions
 from omnibench.fit.span import driven_span
-from omnibench.report.numbers import fixed, noise_in_words, significant
+from omnibench.report.numbers import drive_in_words, noise_in_words
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
@@ -35,31 +35,12 @@ from omnibench.simulate.commands import Command, Shapes, TimedCommand
 from omnibench.simulate.config import SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
-from omnibench.words import noun_for, plural
+from omnibench.words import noun_for
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
 _MOST_COMMANDS = 5000  # commands of a set, at most
 _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most
 Name = Annotated[str, Field(min_length=1, max_length=60)]
-
-
-class CommandGrid(motion.MotionGrid):
-    """A grid of commands: every direction with every turn rate, at each speed."""
-
-    distance: Positive | None = Field(None, description="length of each run, m; or give duration")
-    duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
-
-    @model_validator(mode="after")
-    def _length_is_given(self) -> CommandGrid:
-        if any(self.speeds) and (self.distance is None) == (self.duration is None):
-            raise ValueError("give the length of the runs: either distance (m) or duration (s)")
-        return self
-
-    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
-        """The commands in the order of the grid. ValueError: the robot's wheels do not roll in a direction."""
-        for command in self.grid(robot):
-            driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
-            yield TimedCommand(command, driven if command.speed else self.turn_duration)
 
 
 class OtherSet(Model):
@@ -74,7 +55,7 @@ def _kind(block: Any) -> str:
 
 
 Block = Annotated[
-    Annotated[CommandGrid, Tag("grid")]
+    Annotated[motion.CommandGrid, Tag("grid")]
     | Annotated[motion.SingleCommand, Tag("command")]
     | Annotated[OtherSet, Tag("set")],
     Discriminator(_kind),
@@ -154,8 +135,6 @@ Use = Literal["final", "trajectory"]
 # Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels).
 Per = Literal["run", "second", "metre"]
 
-_WAYS = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}  # deg
-
 
 @dataclass(frozen=True, eq=False)
 class CandidateRun:
@@ -178,20 +157,9 @@ class CandidateRun:
 
     @property
     def in_words(self) -> str:
-        """The command as a person drives it: ``forward 2 m at 0.5 m/s, turning left by 90° with radius 1.2 m``."""
-        speed, direction, rate = self.runs[0].v, self.runs[0].alpha, self.runs[0].omega
-        if speed is None or direction is None or rate is None:
-            return self.name
-        turned = math.degrees(abs(rate) * (self.distance / speed if speed else self.duration))
-        turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
-        side = "left" if rate > 0 else "right"
-        if not speed:
-            return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
-        degrees = round(math.degrees(direction), 3) % 360
-        aside = f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {'left' if degrees < 180 else 'right'} of forward,"
-        length = f"{significant(self.distance, 2)} m at {significant(speed, 2)} m/s"
-        turning = f", turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m" if rate else ""
-        return f"{_WAYS.get(degrees, aside)} {length}{turning}"
+        """The command as a person drives it."""
+        run = self.runs[0]
+        return drive_in_words(self.name, run.v, run.alpha, run.omega, self.duration, self.distance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -363,14 +363,14 @@ def _mostly(values: Array) -> float:
     return float(np.quantile(values, _OFTEN))
 
 
+ChosenRuns = Sequence[tuple[CommandedRun, int]]  # with how often each is driven
+Pairs = Sequence[tuple[str, str]]  # of members
 _SHORTEST_POSES = 0.02  # s between the reference poses that are simulated: denser ones take long and tell little more
 
 
-def description_of(
-    names: Sequence[str], runs: int, minutes: float, choice: Choice, inseparable: Sequence[tuple[str, str]]
-) -> str:
+def description_of(names: Sequence[str], minutes: float, choice: Choice, inseparable: Pairs) -> str:
     """How much to drive, and what it tells, in a few sentences."""
-    hour = f"within {LONGEST / 60:.0f} minutes"
+    hour, runs = f"within {LONGEST / 60:.0f} minutes", int(choice.counts.sum())
     if not runs:
         return f"Nothing that this robot can drive {hour} surely tells {listing(list(names), last='from')}."
     from_first = {first: [second for one, second in inseparable if one == first] for first, _ in inseparable}
@@ -386,11 +386,7 @@ def description_of(
 
 
 def plan_config(
-    dataset: Dataset,
-    fit: Fit,
-    effects: Sequence[NamedEffect],
-    effect: NamedEffect,
-    chosen: Sequence[tuple[CommandedRun, int]],
+    dataset: Dataset, fit: Fit, effects: Sequence[NamedEffect], members: Sequence[str], chosen: ChosenRuns
 ) -> str:
     """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
     between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
@@ -409,11 +405,10 @@ def plan_config(
         noise=EncoderNoise(**fit.noise.noise.model_dump()),
         train=Session(seed=1, distance=1.0),
     )
-    members = ", ".join((effect.name, *effect.confusable_with))
     return to_yaml(
         {
             "name": f"{dataset.name}_experiment",
-            "description": f"Tells {members} apart; simulated with the first.",
+            "description": f"Tells {', '.join(members)} apart; simulated with the first.",
             "datasets": {"experiment": {"simulate": config.model_dump(mode="json", exclude_defaults=True)}},
         }
     )
@@ -461,18 +456,18 @@ def _experiment(
     of_recorded = float(np.mean([run.pose_times[-1] for run in fit.runs])) + PLACING
     choice = choose_runs(separation, information, seconds, of_recorded)
     chosen = [(candidates[index], int(choice.counts[index])) for index in np.flatnonzero(choice.counts)]
-    runs, minutes = int(choice.counts.sum()), float(choice.counts @ seconds) / 60
+    separates, minutes = (effect.name, *effect.confusable_with), float(choice.counts @ seconds) / 60
     names = [group.name for group in members]
     pairs = zip(*np.nonzero(np.triu(~choice.sure)), strict=True)
     inseparable = tuple((names[first], names[second]) for first, second in pairs)
     return Experiment(
-        (effect.name, *effect.confusable_with),
-        description_of(names, runs, minutes, choice, inseparable),
-        plan_config(dataset, fit, effects, effect, chosen) if chosen else "",
+        separates,
+        description_of(names, minutes, choice, inseparable),
+        plan_config(dataset, fit, effects, separates, chosen) if chosen else "",
         tuple(ExperimentCommand(each.in_words, count, each.timed.duration) for each, count in chosen),
-        runs,
+        int(choice.counts.sum()),
         minutes,
-        chance=choice.chance if chosen else 0.0,
-        chance_recorded=choice.chance_recorded if chosen else 0.0,
-        inseparable=inseparable,
+        choice.chance if chosen else 0.0,
+        choice.chance_recorded if chosen else 0.0,
+        inseparable,
     )

@@ -216,6 +216,25 @@ class MotionGrid(Model):
         ]
 
 
+class CommandGrid(MotionGrid):
+    """A grid of commands: every direction with every turn rate, at each speed."""
+
+    distance: Positive | None = Field(None, description="length of each run, m; or give duration")
+    duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
+
+    @model_validator(mode="after")
+    def _length_is_given(self) -> CommandGrid:
+        if any(self.speeds) and (self.distance is None) == (self.duration is None):
+            raise ValueError("give the length of the runs: either distance (m) or duration (s)")
+        return self
+
+    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
+        """The commands in the order of the grid. ValueError: the robot's wheels do not roll in a direction."""
+        for command in self.grid(robot):
+            driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
+            yield TimedCommand(command, driven if command.speed else self.turn_duration)
+
+
 class SingleCommand(Model):
     """One command with its own duration."""
 

@@ -391,7 +391,7 @@ def test_the_command_prints_what_to_drive_and_how_precise_it_will_be(command: Co
     assert "What to drive:\n  forward " in printed
     assert "sideways to the left " in printed
     assert "Calibrated from these runs, the matrix leaves an error of" in printed
-    assert "noise assumed: positions white 10 mm, walk 3 mm/√s, headings white 0.29°" in " ".join(printed.split())
+    assert "noise assumed: positions white 10 mm, walk 3.0 mm/√s, headings white 0.29°" in printed
     report = Path("design/report.html").read_text(encoding="utf-8")
     assert 0 < report.index("<h4>What to drive of ") < report.index("<h2>Chosen commands")
 

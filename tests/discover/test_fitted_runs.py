@@ -670,7 +670,7 @@ def test_steering_is_turned_within_a_run_where_its_play_is_in_doubt() -> None:
 
 def test_effects_that_nothing_tells_apart_are_listed_with_all_that_each_looks_like() -> None:
     choice = Choice(np.array([1]), 0.6, 0.0, np.eye(3, dtype=bool))
-    said = description_of("abc", 1, 0.5, choice, [("a", "b"), ("a", "c"), ("b", "c")])
+    said = description_of("abc", 0.5, choice, [("a", "b"), ("a", "c"), ("b", "c")])
     assert said.endswith("surely tells a from b or c; nor b from c.")
 
 
