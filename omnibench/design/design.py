@@ -312,13 +312,12 @@ def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     first = candidate.runs[0]
     picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
     path = np.round(relative(first.start, first.poses[picks]), 5)
-    known = first.v is not None and first.alpha is not None and first.omega is not None
     angles = [(np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None]).sum(axis=0) for run in candidate.runs]
     return Candidate(
         name=candidate.name,
-        speed=first.v if known else None,
-        direction=first.alpha if known else None,
-        turn_rate=first.omega if known else None,
+        speed=first.v,
+        direction=first.alpha,
+        turn_rate=first.omega,
         duration_s=candidate.duration,
         distance_m=candidate.distance,
         rolled_m=float(np.mean(angles * robot.radii)),
@@ -401,14 +400,10 @@ def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDe
     designs = [problem.of_all(name, counts) for counts in exact if candidates.identifies(counts)]
     steps = [problem.step(counts, optimum.bound) for counts in designs]
     numbers = [step.effort.runs for step in steps]
-    if runs is not None and runs not in numbers:
-        span = f"from {numbers[0]} to {numbers[-1]} can" if numbers else "none can"
-        why = f"{plural(runs, 'run')} cannot be chosen so that they identify the matrix; {span}"
-        raise ConfigError(f"{pool.source}: {name}: {why}")
-    if not steps:
-        raise ConfigError(
-            f"{pool.source}: {name}: no design that the repetitions allow identifies the matrix; allow more"
-        )
+    if not steps or (runs is not None and runs not in numbers):
+        wanted = "no number of runs can" if runs is None else f"{plural(runs, 'run')} cannot"
+        span = f"from {numbers[0]} to {numbers[-1]} can" if numbers else "allow more runs or repetitions"
+        raise ConfigError(f"{pool.source}: {name}: {wanted} be chosen so that they identify the matrix; {span}")
     best = max(steps, key=lambda step: min(step.efficiency, GOOD_EFFICIENCY))  # the first of those that are good
     chosen = steps.index(best) if runs is None else numbers.index(runs)
     commands = [problem.described[index].name for index in pool.sets[name]]
