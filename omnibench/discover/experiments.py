@@ -390,7 +390,7 @@ def plan_config(
 ) -> str:
     """The experiment as a config for ``omnibench simulate``, with the effects that were found as its truth."""
     between = float(np.median(np.concatenate([np.diff(run.pose_times) for run in dataset.split("train")])))
-    listed = [ListedCommand.of(each.timed, repetitions=count, heading_deg=each.heading) for each, count in chosen]
+    listed = [ListedCommand.of(each.timed, 4, repetitions=count, heading_deg=each.heading) for each, count in chosen]
     steered = [run.steering for candidate, _ in chosen for run in candidate.runs if run.steering is not None]
     largest = max((float(np.abs(angles).max(initial=0.0)) for angles in steered), default=None)
     found = [each for each in effects if each.stage != "actuator"]

@@ -260,13 +260,11 @@ class SingleCommand(Model):
         yield TimedCommand(self.command(robot), self.duration)
 
     @classmethod
-    def of(cls, timed: TimedCommand, **fields: Any) -> Self:
-        """A command as a config lists it, its direction as a person writes it. fields: further ones."""
-        command = timed.command
-        degrees = round(math.degrees(command.direction), 6)
-        return cls(
-            speed=command.speed, direction_deg=degrees, turn_rate=command.turn_rate, duration=timed.duration, **fields
-        )
+    def of(cls, timed: TimedCommand, digits: int = 12, **fields: Any) -> Self:
+        """A command as a config lists it. digits: decimals of its rate of turn, rad/s. fields: further ones."""
+        command, degrees = timed.command, round(math.degrees(timed.command.direction), 6)
+        rate = round(command.turn_rate, digits)
+        return cls(speed=command.speed, direction_deg=degrees, turn_rate=rate, duration=timed.duration, **fields)
 
 
 class ListedCommand(SingleCommand):
