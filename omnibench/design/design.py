@@ -205,6 +205,14 @@ class DesignProblem:
         self.costs = np.array([effort[per] for effort in efforts])
         directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
+        # Mean information (C, p, p) of a run of each candidate, for each use
+        self.information: dict[Use, Array] = {}
+        for each in USES:
+            noise = evenly(pool.noise) if each == "final" else pool.noise
+            stamps: Stamps = "final" if each == "final" else "reference"
+            model = (pool.robot.inverse_kinematic_matrix, pool.integration, noise)
+            of_runs = [information_of_runs(run.runs, *model, stamps=stamps).mean(axis=0) for run in pool.candidates]
+            self.information[each] = self.basis.T @ np.array(of_runs) @ self.basis
         # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
         self.physical: Array | None = None
         geometry = WheelGeometry(pool.robot)
@@ -223,18 +231,8 @@ class DesignProblem:
         """
         pool = self.pool
         chosen = list(range(len(self.described)) if name is None else pool.sets[name])
-        noise = evenly(pool.noise) if use == "final" else pool.noise
-        stamps: Stamps = "final" if use == "final" else "reference"
-        matrix = pool.robot.inverse_kinematic_matrix
-        information = [
-            information_of_runs(pool.candidates[index].runs, matrix, pool.integration, noise, stamps=stamps).mean(
-                axis=0
-            )
-            for index in chosen
-        ]
         try:
-            reduced = self.basis.T @ np.array(information) @ self.basis
-            return d_optimality.Candidates(reduced, self.costs[chosen], self.repetitions)
+            return d_optimality.Candidates(self.information[use][chosen], self.costs[chosen], self.repetitions)
         except d_optimality.UndeterminedError as error:
             elements = (self.basis @ error.direction).reshape(3, -1)
             direction = direction_in_words(np.linalg.svd(elements)[2][0], pool.robot.drive.names)
