@@ -60,6 +60,12 @@ def _load_robot(value: Any) -> Any:
     return validate(Robot, content.get("robot", content) if isinstance(content, Mapping) else content, str(value))
 
 
+def read_robot(path: Path) -> Robot:
+    """The robot that a YAML file holds. ConfigError in one line: it holds none."""
+    robot: Robot = _load_robot(path)
+    return robot
+
+
 RobotOption = Annotated[Robot, BeforeValidator(_load_robot)]
 """A robot as in dataset.yaml, or the path of a YAML file that holds one: by itself, or under the key ``robot`` as a
 dataset.yaml or a calibration file does."""

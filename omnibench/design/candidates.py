@@ -9,56 +9,38 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from omnibench.config import Model, Positive, read_yaml, validate
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.data.recording_options import RobotOption
+from omnibench.data.recording_options import RobotOption, read_robot
 from omnibench.data.splits import training_split
 from omnibench.data.storage import load_dataset
-from omnibench.design.d_optimality import Counts
+from omnibench.design.exchange import Counts
 from omnibench.errors import ConfigError, DataError, OmnibenchError, UnknownNameError
-from omnibench.fit.identifiability import identifiability
-from omnibench.fit.span import aligned, direction_in_words, driven_span, motion_in_words
+from omnibench.fit.identifiability import identifiability, kept_motions
+from omnibench.fit.span import driven_span
+from omnibench.report.numbers import drive_in_words, noise_in_words
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Robot
 from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate import commands as motion
 from omnibench.simulate.commands import Command, Shapes, TimedCommand
-from omnibench.simulate.config import RobotConfig, SteeringLimit
+from omnibench.simulate.config import SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
-from omnibench.words import noun_for, plural
+from omnibench.words import noun_for
 
 # They guard memory against slips of the pen and decide nothing else: so many samples of four wheels take 640 MB.
 _MOST_COMMANDS = 5000  # commands of a set, at most
 _MOST_SAMPLES = 2e7  # wheel samples and poses of a set's commands together, at most
 Name = Annotated[str, Field(min_length=1, max_length=60)]
-
-
-class CommandGrid(motion.MotionGrid):
-    """A grid of commands: every direction with every turn rate, at each speed."""
-
-    distance: Positive | None = Field(None, description="length of each run, m; or give duration")
-    duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
-
-    @model_validator(mode="after")
-    def _length_is_given(self) -> CommandGrid:
-        if any(self.speeds) and (self.distance is None) == (self.duration is None):
-            raise ValueError("give the length of the runs: either distance (m) or duration (s)")
-        return self
-
-    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
-        """The commands in the order of the grid. ValueError: the robot's wheels do not roll in a direction."""
-        for command in self.grid(robot):
-            driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
-            yield TimedCommand(command, driven if command.speed else self.turn_duration)
 
 
 class OtherSet(Model):
@@ -73,11 +55,15 @@ def _kind(block: Any) -> str:
 
 
 Block = Annotated[
-    Annotated[CommandGrid, Tag("grid")]
+    Annotated[motion.CommandGrid, Tag("grid")]
     | Annotated[motion.SingleCommand, Tag("command")]
     | Annotated[OtherSet, Tag("set")],
     Discriminator(_kind),
 ]
+
+# One block stands for a list of it.
+_listed = BeforeValidator(lambda block: [block] if isinstance(block, Mapping) else block, Block | tuple[Block, ...])
+Blocks = Annotated[tuple[Block, ...], _listed]
 
 
 class DesignBaseline(Model):
@@ -99,17 +85,10 @@ class DesignConfig(Model):
     sample_period: Positive = Field(0.01, description="time between wheel samples, s")
     pose_period: Positive = Field(0.25, description="time between reference poses, s")
     noise: Noise = Field(description="of the reference poses, as far as it is known")
-    sets: dict[Name, tuple[Block, ...]] = Field(
+    sets: dict[Name, Blocks] = Field(
         min_length=1, description="each a grid of commands, or a list of grids, single commands and other sets"
     )
     baseline: DesignBaseline
-
-    @field_validator("sets", mode="before", json_schema_input_type=dict[Name, Block | tuple[Block, ...]])
-    @classmethod
-    def _one_block_stands_for_a_list(cls, sets: Any) -> Any:
-        if not isinstance(sets, Mapping):
-            return sets
-        return {name: [blocks] if isinstance(blocks, Mapping) else blocks for name, blocks in sets.items()}
 
     @model_validator(mode="after")
     def _sets_are_known_and_of_a_size(self) -> DesignConfig:
@@ -128,10 +107,8 @@ class DesignConfig(Model):
                 raise ValueError(f"sets.{name}: {why}; take such commands out")
             samples = sum(command.duration for command in commands) * (1 / self.sample_period + 1 / self.pose_period)
             if len(commands) > _MOST_COMMANDS or samples > _MOST_SAMPLES:
-                raise ValueError(
-                    f"sets.{name}: {plural(len(commands), 'command')} with {samples:.1g} wheel samples and poses, more "
-                    f"than {_MOST_COMMANDS} or {_MOST_SAMPLES:.0e}; check the grids, durations and periods"
-                )
+                size = f"{len(commands)} commands of {samples:.1g} samples, of {_MOST_COMMANDS} and {_MOST_SAMPLES:.0e}"
+                raise ValueError(f"sets.{name}: {size} at most; check the grids, durations and periods")
         return self
 
     def commands(self, name: str) -> tuple[TimedCommand, ...]:
@@ -140,23 +117,23 @@ class DesignConfig(Model):
 
     def _expanded(self, name: str, above: tuple[str, ...]) -> Iterator[TimedCommand]:
         for block in self.sets[name]:
-            if not isinstance(block, OtherSet):
-                try:
+            try:
+                if not isinstance(block, OtherSet):
                     yield from block.commands(self.robot)
-                except ValueError as error:
-                    raise ValueError(f"sets.{name}: {error}") from None
-            elif block.set not in self.sets:
+                    continue
+            except ValueError as error:
+                raise ValueError(f"sets.{name}: {error}") from None
+            if block.set not in self.sets:
                 raise ValueError(str(UnknownNameError("set", block.set, self.sets, f"sets.{name}")))
-            elif block.set in (*above, name):
+            if block.set in (*above, name):
                 raise ValueError(f"sets.{name}: includes {block.set!r}, which includes {name!r}; leave one out")
-            else:
-                yield from self._expanded(block.set, (*above, name))
+            yield from self._expanded(block.set, (*above, name))
 
 
+# Reference poses that a calibration uses: the final one alone, as Eq. (6), or all of them under the noise model.
 Use = Literal["final", "trajectory"]
-"""Reference poses that a calibration uses: the final one alone, as Eq. (6), or all of them under the noise model."""
+# Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels).
 Per = Literal["run", "second", "metre"]
-"""Cost of a run: 1, its duration, or the distance that its wheels roll (mean of the wheels)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +148,34 @@ class CandidateRun:
         """The mean duration of the command's runs, s."""
         return float(np.mean([run.pose_times[-1] for run in self.runs]))
 
+    @property
+    def distance(self) -> float:
+        """The way of the robot's centre, m: as commanded, or else along the reference poses."""
+        if self.runs[0].distance is not None:
+            return self.runs[0].distance
+        return float(np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in self.runs]))
+
+    @property
+    def in_words(self) -> str:
+        """The command as a person drives it."""
+        run = self.runs[0]
+        return drive_in_words(self.name, run.v, run.alpha, run.omega, self.duration, self.distance)
+
+
+@dataclass(frozen=True, eq=False)
+class CommandedRun(CandidateRun):
+    """A command with its one run at the design values. heading: at its start, deg; None: any."""
+
+    timed: TimedCommand
+    heading: float | None = None
+
+    @property
+    def in_words(self) -> str:
+        variation = self.timed.variation
+        heading = "" if self.heading is None else f", from a heading of {self.heading:.0f}°"
+        weave = f", weaving by {variation.weave:g} rad/s every {variation.period:g} s" if variation.weave else ""
+        return f"{super().in_words}{heading}{weave}{', turning back halfway' if variation.reversals else ''}"
+
 
 @dataclass(frozen=True, eq=False)
 class CandidatePool:
@@ -182,101 +187,113 @@ class CandidatePool:
 
     source: str
     name: str
+    description: str
     robot: Robot
     integration: Integration
+    candidates: Sequence[CandidateRun]
+    sets: Mapping[str, Sequence[int]]
+    baseline: Counts
     baseline_name: str
     noise: Noise
     noise_source: str
-    description: str = ""
-    notes: tuple[str, ...] = ()
-    candidates: tuple[CandidateRun, ...] = ()
-    sets: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    baseline: Counts = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    simulated: bool = True
-    recorded: bool = False
-
-    def commanded(
-        self,
-        periods: tuple[float, float],
-        sets: Mapping[str, Sequence[TimedCommand]],
-        driven: Mapping[TimedCommand, int],
-    ) -> CandidatePool:
-        """The pool with candidates of sets of commands, each with the one run of a robot that is exactly as designed.
-
-        periods: of the wheel samples and of the reference poses, s. driven: how often the baseline drives each command.
-        ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
-        """
-        place = self.source
-        if _noiseless(self.noise):
-            raise ConfigError(f"{place}: noise: give position and heading some; without it, runs cannot be weighed")
-        commands = dict.fromkeys(timed for of_set in sets.values() for timed in of_set)
-        places = {timed: index for index, timed in enumerate(commands)}
-        model = OdometryModel.of_design(self.robot, self.integration)
-        names = Counter(timed.command.name for timed in commands)
-        candidates = []
-        for timed in commands:
-            title = timed.command.name
-            title = title if names[title] == 1 else f"{title}_t{timed.duration:.4g}"
-            candidates.append(CandidateRun(title, (run_as_designed(model, timed, periods, title),)))
-        indices = {of_set: tuple(places[timed] for timed in listed) for of_set, listed in sets.items()}
-        for of_set, chosen in indices.items():
-            if len(chosen) == 1:
-                raise ConfigError(f"{place}: {of_set}: it has one command only; a design needs several to choose from")
-            runs = [run for index in chosen for run in candidates[index].runs]
-            require_every_motion(self.robot, runs, f"{place}: {of_set}", ConfigError)
-        baseline = np.array([driven.get(timed, 0) for timed in commands], dtype=np.intp)
-        return replace(self, candidates=tuple(candidates), sets=indices, baseline=baseline)
+    simulated: bool
+    recorded: bool
+    notes: tuple[str, ...]
 
 
 # Shapes of the runs that are offered; more of them change a design little, because it is a choice of few (chosen).
 _SHAPES = Shapes(lines=(0.5, 1.0), radii=(0.1, 0.2, 0.4, 0.8), turns=(45.0, 90.0, 180.0, 360.0), spins=(360.0, 1080.0))
-# deg, m, deg: more is a slip of the pen.
-_MOST = {"steering_limit": 180.0, "position_noise": 10.0, "heading_noise": 90.0}
 _DECIMAL = r"[0-9]+\.?[0-9]*|\.[0-9]+"
 _SET = "robot"  # name of the candidates' set
-_SAMPLE_PERIOD, _POSE_PERIOD = 0.05, 0.25  # s; commands are constant, so that longer samples tell the same
+_SAMPLE_PERIOD = 0.05  # s; commands are constant, so that longer samples tell the same
 # White noise of a motion capture or of scan matching, and per sqrt(s) what a floor and slip add: the order of magnitude
 # of the recordings that omnibench was tried on, 3 to 9 mm.
-ASSUMED_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
+_NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, walk_heading=0.003)
 
 
-_OF_ROBOTS = (
-    "max_speed", "max_turn_rate", "max_wheel_rate", "steering_limit", "area", "position_noise", "heading_noise"
-)  # fmt: skip
+class RobotLimits(Model):
+    """What a robot without recordings may drive, and how well it will be seen; None: the default."""
+
+    max_speed: Positive | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
+    max_turn_rate: Positive | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
+    max_wheel_rate: Positive | None = Field(
+        None, description="With --robot: of any wheel, rad/s. Default: as at max speed."
+    )
+    steering_limit: Annotated[float, Field(gt=0, le=180)] | None = Field(
+        None, description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
+    )
+    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
+    position_noise: Annotated[float, Field(gt=0, lt=10)] | None = Field(
+        None, description="With --robot: of the reference's positions, m. Default: 0.005."
+    )
+    heading_noise: Annotated[float, Field(gt=0, lt=90)] | None = Field(
+        None, description="With --robot: of the reference's headings, deg. Default: 0.3."
+    )
+
+    def config(self, robot: Robot, source: str, integration: Integration = "arc") -> DesignConfig:
+        """Lines, arcs to both sides and turns on the spot, as fast as the limits allow; the baseline drives each once.
+
+        source: for messages. ConfigError: limits that exclude each other or every curve.
+        """
+        speed, rate = self.max_speed or 0.5, self.max_turn_rate or 1.0
+        limit = motion.steering_limit(robot, self.steering_limit)
+        if self.steering_limit is not None and robot.drive.direct:
+            raise ConfigError(f"{source}: --steering-limit: no wheel of this robot steers; leave it out")
+        # Largest wheel rates straight on at the greatest speed, in each direction that the robot drives
+        twists = [Command(speed, math.radians(way), 0.0).twist for way in motion.default_directions(robot)]
+        rates = [float(np.abs(motion.wheels_of(robot, twist)[0]).max()) for twist in twists]
+        wheel_rate = self.max_wheel_rate or max(rates)
+        if wheel_rate < (1 - 1e-9) * min(rates):
+            fastest = math.floor(1000 * speed * wheel_rate / min(rates)) / 1000
+            why = f"at --max-wheel-rate {wheel_rate:g} rad/s the wheels drive at most {fastest:g} m/s"
+            raise ConfigError(f"{source}: --max-speed {speed:g}: {why}; give no more, or raise the wheels' rate")
+        sides = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", self.area or "3x3")
+        wide, deep = map(float, sides.groups()) if sides else (0.0, 0.0)
+        if not 0 < min(wide, deep) <= max(wide, deep) < math.inf:
+            raise ConfigError(f"--area {self.area}: give two sides in m, like --area 3x2.5")
+        half_width = max(math.hypot(*wheel.position) + wheel.radius for wheel in robot.wheels)
+        free, floor = (wide - 2 * half_width, deep - 2 * half_width), f"{wide:g}x{deep:g}"
+        if min(free) < 2 * motion.SHORTEST:
+            least = math.ceil(20 * (half_width + motion.SHORTEST)) / 10
+            why = f"the robot alone takes {2 * half_width:.2g} m; give both sides at least {least:g} m"
+            raise ConfigError(f"{source}: --area {floor}: {why}")
+        drivable = dict.fromkeys(motion.DrivableCommands(robot, speed, rate, wheel_rate, limit, free, _SHAPES))
+        if not any(timed.command.turn_rate for timed in drivable):
+            why = f"no curve that it can drive within {motion.LONGEST:g} s fits an area of {floor} m"
+            way_out = "give a larger --area, or a greater --steering-limit or --max-speed"
+            raise ConfigError(f"{source}: {why}; {way_out}")
+        steering = "" if robot.drive.direct else f", steering angles {math.degrees(limit):g} deg"
+        sizes = {"pose_position": self.position_noise, "pose_heading": math.radians(self.heading_noise or 0.0)}
+        return DesignConfig(
+            name=re.sub(r"[^A-Za-z0-9_.-]+", "_", robot.name).strip("_.-")[:60] or "robot",
+            description="What to drive before anything was recorded.",
+            notes=(
+                f"Commands were made for at most {speed:g} m/s, {rate:g} rad/s, wheels {wheel_rate:.3g} rad/s"
+                f"{steering}, and a free floor of {floor} m, of which its wheels need {half_width:.2g} m.",
+                "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
+            ),
+            robot=robot,
+            steering_limit_deg=self.steering_limit,
+            integration=integration,
+            sample_period=_SAMPLE_PERIOD,
+            noise=_NOISE.model_copy(update={name: size for name, size in sizes.items() if size}),
+            sets={_SET: tuple(map(motion.SingleCommand.of, drivable))},
+            baseline=DesignBaseline(set=_SET, repetitions=1),
+        )
 
 
 class DesignRequest(Model):
     """What ``omnibench design`` was asked for: a data set or config, or a robot's file; None: not given."""
 
     source: Path | None = None
-    use: Use = Field(
-        "trajectory", description="Reference poses to calibrate from: all of a run's, or only its final one."
-    )
+    use: Use = Field("trajectory", description="Reference poses to calibrate from: all of a run's, or its final one.")
     per: Per = Field("run", description="Effort to keep small: runs, time or distance.")
     runs: int | None = Field(None, ge=1, description="Runs to choose. Default: the fewest within 1 % of the optimum.")
     repetitions: int | None = Field(None, ge=1, description="How often a command may be chosen at most.")
     dataset: str | None = Field(None, description="Name of the data set, if the config has several.")
-    integration: Integration | None = Field(
-        None, description="Path within a sample; see calibrate. Default: the config's, or arc for a data set."
-    )
-    robot: Path | None = Field(
-        None, description="Instead of DATASET|CONFIG: a robot alone (robot: as in dataset.yaml)."
-    )
-    max_speed: float | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
-    max_turn_rate: float | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
-    max_wheel_rate: float | None = Field(
-        None, description="With --robot: of any wheel, rad/s. Default: as straight on at the greatest speed."
-    )
-    steering_limit: float | None = Field(
-        None, description="With --robot: largest steering angle, deg. Default: tricycle 80, car 35, others 90."
-    )
-    area: str | None = Field(None, description="With --robot: free floor, m, like 3x2.5. Default: 3x3.")
-    position_noise: float | None = Field(
-        None, description="With --robot: of the reference's positions, m. Default: 0.005."
-    )
-    heading_noise: float | None = Field(
-        None, description="With --robot: of the reference's headings, deg. Default: 0.3."
-    )
+    integration: Integration | None = Field(None, description="Path within a sample. Default: the config's, or arc.")
+    robot: Path | None = Field(None, description="Instead of DATASET|CONFIG: a robot (as in dataset.yaml).")
+    limits: RobotLimits = RobotLimits()
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -288,132 +305,18 @@ class DesignRequest(Model):
 
         ConfigError in one line: both or neither are given, options that go with the other, or a value that cannot be.
         """
-        robot = self.robot
-        given: dict[str, Any] = self.model_dump(include=set(_OF_ROBOTS), exclude_none=True)
-        for name, value in given.items():
-            option = f"--{name.replace('_', '-')}"
-            if robot is None:
-                raise ConfigError(f"{option}: is for --robot FILE, a design without a recording")
-            if name != "area" and not 0 < value < _MOST.get(name, math.inf):
-                below = f" and below {_MOST[name]:g}" if name in _MOST else ""
-                raise ConfigError(f"{option} {value:g}: must be above 0{below}")
-        if robot is None:
-            if self.source is None:
-                raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
-            return self.source
-        if self.source is not None:
-            raise ConfigError(f"--robot {robot}: designs without {self.source}; give one of them")
-        refuse_choice(self.dataset, robot)
-        noise = ASSUMED_NOISE.model_dump()
-        noise["pose_position"] = given.pop("position_noise", noise["pose_position"])
-        noise["pose_heading"] = math.radians(given.pop("heading_noise", math.degrees(noise["pose_heading"])))
-        if "area" in given:
-            text = given["area"]  # the sides, m, like 3x2.5
-            match = re.fullmatch(rf"\s*({_DECIMAL})\s*[xX×]\s*({_DECIMAL})\s*m?\s*", text)
-            given["area"] = sides = tuple(map(float, match.groups())) if match else (0.0, 0.0)
-            if min(sides) <= 0 or not math.isfinite(max(sides)):
-                raise ConfigError(f"--area {text}: give two sides in m, like --area 3x2.5")
-        if "steering_limit" in given:
-            given["steering_limit_deg"] = given.pop("steering_limit")
-        content = {"robot": str(robot), "noise": noise, **given}
-        commands = validate(RobotCommands, content, f"design --robot {robot}")
-        return commands.pool(str(robot), self.integration or "arc")
-
-
-class RobotCommands(Model):
-    """A robot without recordings, and what it may drive.
-
-    Without ``max_wheel_rate`` no wheel turns faster than it does straight on at ``max_speed``.
-    """
-
-    robot: RobotOption
-    max_speed: Positive = Field(0.5, description="m/s")
-    max_turn_rate: Positive = Field(1.0, description="rad/s")
-    max_wheel_rate: Positive | None = Field(None, description="rad/s")
-    area: tuple[Positive, Positive] = Field((3.0, 3.0), description="free floor, m")
-    steering_limit_deg: float | None = Field(None, gt=0, le=180, description="degrees; default: by the type of robot")
-    noise: Noise = ASSUMED_NOISE
-
-    @model_validator(mode="after")
-    def _can_be_driven(self) -> RobotCommands:
-        if self.steering_limit_deg is not None and self.robot.drive.direct:
-            raise ValueError("--steering-limit: no wheel of this robot steers; leave it out")
-        fastest = self.max_speed * self._wheel_rate / min(self._straight_rates)
-        if fastest < (1 - 1e-9) * self.max_speed:
-            raise ValueError(
-                f"--max-speed {self.max_speed:g}: at --max-wheel-rate {self._wheel_rate:g} rad/s the wheels drive at "
-                f"most {math.floor(1000 * fastest) / 1000:g} m/s; give no more, or raise the wheels' rate"
-            )
-        if min(self._free) < 2 * motion.SHORTEST:
-            need = 2 * (self._half_width + motion.SHORTEST)
-            raise ValueError(
-                f"--area {self.area[0]:g}x{self.area[1]:g}: the robot alone takes {2 * self._half_width:.2g} m; give "
-                f"both sides at least {math.ceil(10 * need) / 10:g} m"
-            )
-        return self
-
-    def pool(self, source: str, integration: Integration = "arc") -> CandidatePool:
-        """The candidates of a design, each of which the baseline drives once.
-
-        source: for messages. ConfigError: the commands leave part of the matrix undetermined.
-        """
-        # Lines, arcs to both sides and turns on the spot, each as fast as the limits allow.
-        robot, limit, noise = self.robot, motion.steering_limit(self.robot, self.steering_limit_deg), self.noise
-        drivable = motion.DrivableCommands(
-            robot, self.max_speed, self.max_turn_rate, self._wheel_rate, limit, self._free, _SHAPES
-        )
-        commands = tuple(dict.fromkeys(drivable))
-        floor = f"{self.area[0]:g} x {self.area[1]:g} m"
-        if not any(timed.command.turn_rate for timed in commands):
-            raise ConfigError(
-                f"{source}: no curve that it can drive within {motion.LONGEST:g} s fits an area of {floor}; give a "
-                "larger --area, or a greater --steering-limit or --max-speed"
-            )
-        words = [f"{self.max_speed:g} m/s", f"{self.max_turn_rate:g} rad/s", f"wheels {self._wheel_rate:.3g} rad/s"]
-        if not robot.drive.direct:
-            words.append(f"steering angles {math.degrees(limit):g} deg")
-        pool = CandidatePool(
-            source,
-            robot.name or "robot",
-            robot,
-            integration,
-            baseline_name=f"all {plural(len(commands), 'command')} once",
-            noise=noise,
-            noise_source=(
-                f"assumed: {1000 * noise.pose_position:.3g} mm and {math.degrees(noise.pose_heading):.2g} deg of "
-                f"each reference pose, {1000 * noise.walk_position:.3g} mm and "
-                f"{math.degrees(noise.walk_heading):.2g} deg per √s of floor and slip"
-            ),
-            description="What to drive before anything was recorded.",
-            notes=(
-                f"Commands were made for at most {', '.join(words)}, and a free floor of {floor}, of which the robot's "
-                f"wheels need {self._half_width:.2g} m about its centre.",
-                "Left is counter-clockwise as seen from above, backward too. Begin where a run stays on the floor.",
-            ),
-        )
-        return pool.commanded((_SAMPLE_PERIOD, _POSE_PERIOD), {_SET: commands}, dict.fromkeys(commands, 1))
-
-    @property
-    def _straight_rates(self) -> list[float]:
-        """Largest wheel rates, rad/s, straight on at the greatest speed, in each direction that the robot drives."""
-        directions = map(math.radians, motion.default_directions(self.robot))
-        twists = [Command(self.max_speed, direction, 0.0).twist for direction in directions]
-        return [float(np.abs(motion.wheels_of(self.robot, twist)[0]).max()) for twist in twists]
-
-    @property
-    def _wheel_rate(self) -> float:
-        return self.max_wheel_rate or max(self._straight_rates)
-
-    @property
-    def _half_width(self) -> float:
-        """The farthest that a wheel reaches from the centre, m."""
-        return max(math.hypot(*wheel.position) + wheel.radius for wheel in self.robot.wheels)
-
-    @property
-    def _free(self) -> tuple[float, float]:
-        """Sides, m, of the area that the robot's centre may be in."""
-        wide, deep = (side - 2 * self._half_width for side in self.area)
-        return wide, deep
+        if self.robot is not None:
+            if self.source is not None:
+                raise ConfigError(f"--robot {self.robot}: designs without {self.source}; give one of them")
+            refuse_choice(self.dataset, self.robot)
+            robot = read_robot(self.robot)
+            config = self.limits.config(robot, str(self.robot), self.integration or "arc")
+            return candidates_of_config(config, str(self.robot))
+        for name in self.limits.model_dump(exclude_none=True):
+            raise ConfigError(f"--{name.replace('_', '-')}: is for --robot FILE, a design without a recording")
+        if self.source is None:
+            raise ConfigError("name a DATASET or a CONFIG, or a robot's file with --robot FILE")
+        return self.source
 
 
 def read_candidates(
@@ -432,13 +335,20 @@ def read_candidates(
         refuse_choice(dataset, path)
         return candidates_of_dataset(load_dataset(path), integration or "arc", str(path))
     content = read_yaml(path)
-    if isinstance(content, Mapping) and "datasets" in content:
-        compared = validate(ComparedData, content, str(path), path.resolve().parent)
-        return _candidates_of_comparison(compared, dataset, integration, str(path))
-    refuse_choice(dataset, path)
-    config = validate(DesignConfig, content, str(path))
-    return candidates_of_config(
-        config if integration is None else config.model_copy(update={"integration": integration}), str(path)
+    if not (isinstance(content, Mapping) and "datasets" in content):
+        refuse_choice(dataset, path)
+        config = validate(DesignConfig, content, str(path))
+        chosen = integration or config.integration
+        return candidates_of_config(config.model_copy(update={"integration": chosen}), str(path))
+    compared = validate(ComparedData, content, str(path), path.resolve().parent)
+    known = compared.datasets
+    if dataset is not None and dataset not in known:
+        raise UnknownNameError("data set", dataset, known, str(path))
+    if dataset is None and len(known) > 1:
+        raise ConfigError(f"{path}: it has several data sets; choose one with --dataset: {', '.join(known)}")
+    name = dataset or next(iter(known))
+    return candidates_of_dataset(
+        known[name].load(name), integration or compared.integration, f"{path}: data set {name}"
     )
 
 
@@ -450,11 +360,9 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
     place = source or f"data set {dataset.name}"
     training = training_split(dataset)
     if not any(run.has_poses for run in training):
-        raise DataError(
-            f"{place}: its runs have distances, turns and the like and no reference poses, from whose noise a design "
-            "is chosen; without a recording: omnibench design --robot FILE; what to drive without poses: "
-            "omnibench guide references"
-        )
+        why = "its runs have no reference poses, from whose noise a design is chosen"
+        way_out = "without a recording: omnibench design --robot FILE; without poses: omnibench guide references"
+        raise DataError(f"{place}: {why}; {way_out}")
     commands: dict[str, list[Trajectory]] = {}
     for run in training:
         if run.command is not None and run.has_poses:
@@ -480,7 +388,7 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
         robot=dataset.robot,
         integration=integration,
         candidates=tuple(CandidateRun(name, tuple(runs)) for name, runs in commands.items()),
-        sets={dataset.name: tuple(range(len(commands)))},
+        sets={dataset.name: range(len(commands))},
         baseline=np.array([len(runs) for runs in commands.values()]),
         baseline_name=f"the {len(named)} {noun_for(len(named), 'training run')} of {dataset.name}",
         noise=identified.noise,
@@ -492,62 +400,43 @@ def candidates_of_dataset(dataset: Dataset, integration: Integration = "arc", so
 
 
 def candidates_of_config(config: DesignConfig, source: str = "") -> CandidatePool:
-    """The commands of a design config, driven as designed.
+    """The commands of a design config, each with the one run of a robot that is exactly as designed.
 
     ConfigError: a set leaves part of the matrix undetermined, or has one command; the noise is zero.
     """
-    commands = {name: config.commands(name) for name in config.sets}
-    baseline, count = config.baseline, len(commands[config.baseline.set])
-    pool = CandidatePool(
-        source or f"config {config.name}",
-        config.name,
-        config.robot,
-        config.integration,
-        baseline_name=f"{count} {noun_for(count, 'command')} of {baseline.set} x {baseline.repetitions}",
-        noise=config.noise,
-        noise_source="assumed: as the config says",
+    place, robot, baseline = source or f"config {config.name}", config.robot, config.baseline
+    if _noiseless(config.noise):
+        raise ConfigError(f"{place}: noise: give position and heading some; without it, runs cannot be weighed")
+    sets = {name: config.commands(name) for name in config.sets}
+    commands = list(dict.fromkeys(timed for of_set in sets.values() for timed in of_set))
+    same_names = Counter(timed.command.name for timed in commands)
+    model, periods = OdometryModel.of_design(robot, config.integration), (config.sample_period, config.pose_period)
+    candidates = {}
+    for timed in commands:
+        name = timed.command.name + (f"_t{timed.duration:.4g}" if same_names[timed.command.name] > 1 else "")
+        candidates[timed] = CommandedRun(name, (run_as_designed(model, timed, periods, name),), timed)
+    for name, of_set in sets.items():
+        if len(of_set) == 1:
+            raise ConfigError(f"{place}: {name}: it has one command only; a design needs several to choose from")
+        runs = [run for timed in of_set for run in candidates[timed].runs]
+        require_every_motion(robot, runs, f"{place}: {name}", ConfigError)
+    driven, repetitions = sets[baseline.set], baseline.repetitions
+    return CandidatePool(
+        source=place,
+        name=config.name,
         description=config.description,
+        robot=robot,
+        integration=config.integration,
+        candidates=tuple(candidates.values()),
+        sets={name: [commands.index(timed) for timed in of_set] for name, of_set in sets.items()},
+        baseline=np.array([repetitions if timed in driven else 0 for timed in commands]),
+        baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {baseline.set} x {repetitions}",
+        noise=config.noise,
+        noise_source="assumed: positions {}, headings {}".format(*noise_in_words(config.noise)),
+        simulated=True,
+        recorded=False,
         notes=config.notes,
     )
-    driven = dict.fromkeys(commands[baseline.set], baseline.repetitions)
-    return pool.commanded((config.sample_period, config.pose_period), commands, driven)
-
-
-def _candidates_of_comparison(
-    config: ComparedData, name: str | None, integration: Integration | None, place: str
-) -> CandidatePool:
-    if name is not None and name not in config.datasets:
-        raise UnknownNameError("data set", name, config.datasets, place)
-    if name is None and len(config.datasets) > 1:
-        raise ConfigError(f"{place}: it has several data sets; choose one with --dataset: {', '.join(config.datasets)}")
-    name = name or next(iter(config.datasets))
-    source, chosen = config.datasets[name], integration or config.integration
-    flower = source.simulate
-    if isinstance(flower, RobotConfig):
-        raise ConfigError(
-            f"{place}: data set {name} is a simulated robot, whose noise is not stated beforehand; make it with "
-            "`omnibench simulate`, and design from its folder"
-        )
-    if flower is None:
-        return candidates_of_dataset(source.load(name), chosen, f"{place}: data set {name}")
-    # The commands that the training session of a simulated data set drives, with the noise that is simulated
-    driven = Counter[TimedCommand]()
-    for planned in flower.planned(flower.train):
-        driven[planned.timed] += planned.repetitions
-    times = {*driven.values()}
-    often = f" x {times.pop()}" if len(times) == 1 else f", {plural(driven.total(), 'run')}"
-    scale = flower.train.noise_scale
-    pool = CandidatePool(
-        place,
-        name,
-        flower.robot,
-        chosen,
-        baseline_name=f"{len(driven)} {noun_for(len(driven), 'command')} of {name}{often}",
-        noise=Noise(**{kind: scale * getattr(flower.noise, kind) for kind in Noise.model_fields}),
-        noise_source="assumed: what the config simulates for training",
-        notes=config.notes,
-    )
-    return pool.commanded((flower.sample_period, flower.pose_period), {name: tuple(driven)}, driven)
 
 
 def _noiseless(noise: Noise) -> bool:
@@ -560,20 +449,10 @@ def _noiseless(noise: Noise) -> bool:
 
 def require_every_motion(robot: Robot, runs: Sequence[Trajectory], place: str, error: type[OmnibenchError]) -> None:
     """Raise ``error`` where runs leave out a motion that the robot can make, whose part of the matrix stays unknown."""
-    # Signals (M, D) of the robot's motions without slip, orthonormal.
-    possible, _ = np.linalg.qr(robot.signal_equations @ robot.motions.T)
-    count = possible.shape[1]
-    _, strengths, motions = np.linalg.svd(np.vstack([driven_span(runs).strong @ possible, np.zeros((count, count))]))
-    missing = motions[strengths < 0.5] @ possible.T
-    if len(missing):
-        words = [
-            f"{direction_in_words(direction, robot.drive.names)} ({motion_in_words(direction, robot)})"
-            for direction in aligned(missing, robot)
-        ]
-        raise error(
-            f"{place}: its commands do not drive the wheels along {' nor along '.join(words)}, beyond what slip may "
-            "do, and so cannot identify the matrix there; add commands that do"
-        )
+    if missing := kept_motions(robot, driven_span(runs), "matrix", "keep"):
+        words = " nor along ".join(f"{each.words} ({each.motion})" for each in missing)
+        what = "beyond what slip may do, and so cannot identify the matrix there; add commands that do"
+        raise error(f"{place}: its commands do not drive the wheels along {words}, {what}")
 
 
 def refuse_choice(dataset: str | None, source: Path | str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import get_args
 
@@ -19,10 +20,12 @@ from omnibench.config import Model
 from omnibench.data.dataset import Dataset
 from omnibench.design import d_optimality
 from omnibench.design.candidates import CandidatePool, CandidateRun, Per, Use, read_candidates
+from omnibench.design.exchange import Counts
 from omnibench.errors import ConfigError, require_choice, require_range
 from omnibench.fit.geometry import WheelGeometry
 from omnibench.fit.span import direction_in_words, driven_span
-from omnibench.fit.trajectory_fit import information_of_runs
+from omnibench.fit.trajectory_fit import Stamps, information_of_runs
+from omnibench.report.numbers import motion_in_words
 from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array, Robot, class_of, relative
 from omnibench.robot.odometry import Integration
@@ -39,9 +42,20 @@ class Candidate(Model):
     duration_s: float
     distance_m: float = Field(description="way of the robot's centre")
     rolled_m: float = Field(description="way that the wheels roll, mean of the wheels")
+    words: str = Field(exclude=True, repr=False, description="as a person drives it")
     path: tuple[tuple[float, float, float], ...] = Field(
         exclude=True, repr=False, description="poses along a run from (0, 0, 0), for drawing: m, m, rad"
     )
+
+    @property
+    def motion(self) -> str:
+        """The command as ``0.2 m/s at 30°, −0.35 rad/s``."""
+        return motion_in_words(self.name, self.speed, self.direction, self.turn_rate)
+
+    @property
+    def turned(self) -> float:
+        """The angle that a run turns by, rad; positive to the left."""
+        return self.path[-1][2] - self.path[0][2]
 
 
 class Effort(Model):
@@ -131,10 +145,6 @@ class SetDesign(Model):
     steps: tuple[Step, ...] = Field(description="the best runs found, more and more of them")
     equivalents: tuple[Equivalent, ...]
 
-    def equivalent(self, use: Use) -> Equivalent:
-        """The smallest design for a use that equals the baseline."""
-        return next(equal for equal in self.equivalents if equal.use == use)
-
 
 class Baseline(Model):
     """The experiment that designs are compared with."""
@@ -172,6 +182,13 @@ class Design(Model):
 
 USES: tuple[Use, ...] = get_args(Use)
 _PATH_POINTS = 160  # points that a path is drawn with, one for each few pixels of a figure
+# Half of each of these numbers (or of the distance from 1) and twice choose the same runs of twelve commands
+# (tests/studies/constants_fit.py).
+# Share of the bound: the recommended design is the smallest that reaches it. The rest is worth 0.5 % of a deviation.
+GOOD_EFFICIENCY = 0.99
+_MOST_STEPS = 400  # runs: designs are listed up to the baseline's number, but no further than this
+_MOST_RUNS = 2000  # runs or repetitions that may be asked for: more are a slip of the pen
+_LEAST_SHARE = 1e-4  # a command with less of the continuous optimum is not listed: less than a run in 10,000
 
 
 class DesignProblem:
@@ -182,132 +199,127 @@ class DesignProblem:
     """
 
     def __init__(self, pool: CandidatePool, use: Use, per: Per, repetitions: int | None) -> None:
-        self.pool, self.use, self.per, self.repetitions = pool, use, per, repetitions
+        self.pool, self.use, self.repetitions = pool, use, repetitions
         self.described = tuple(_described(candidate, pool.robot) for candidate in pool.candidates)
         efforts = [{"run": 1.0, "second": run.duration_s, "metre": run.rolled_m} for run in self.described]
         self.costs = np.array([effort[per] for effort in efforts])
         directions = driven_span([run for candidate in pool.candidates for run in candidate.runs]).strong
         self.basis: Array = np.kron(np.eye(3), directions.T)
-        self.information = {name: self._information(name) for name in USES}
-        self._candidates: dict[tuple[Use, str | None], d_optimality.Candidates] = {}
+        # Mean information (C, p, p) of a run of each candidate, for each use
+        self.information: dict[Use, Array] = {}
+        for each in USES:
+            noise = evenly(pool.noise) if each == "final" else pool.noise
+            stamps: Stamps = "final" if each == "final" else "reference"
+            model = (pool.robot.inverse_kinematic_matrix, pool.integration, noise)
+            of_runs = [information_of_runs(run.runs, *model, stamps=stamps).mean(axis=0) for run in pool.candidates]
+            self.information[each] = self.basis.T @ np.array(of_runs) @ self.basis
         # Of three omni wheels the derivatives (9, 9) of the physical parameters by the matrix elements.
-        self._physical: Array | None = None
+        self.physical: Array | None = None
         geometry = WheelGeometry(pool.robot)
         if len(directions) == 3 and class_of(pool.robot) == "omni" and len(geometry.names) == self.basis.shape[1]:
-            self._physical = np.linalg.inv(geometry.slopes(geometry.start))
+            self.physical = np.linalg.inv(geometry.slopes(geometry.start))
 
-    def _information(self, use: Use) -> Array:
-        """Mean information (C, p, p) of a run of each candidate."""
-        noise = self.pool.noise if use == "trajectory" else evenly(self.pool.noise)
-        matrix = self.pool.robot.inverse_kinematic_matrix
-        means = [
-            information_of_runs(
-                candidate.runs, matrix, self.pool.integration, noise, stamps="final" if use == "final" else "reference"
-            ).mean(axis=0)
-            for candidate in self.pool.candidates
-        ]
-        return self.basis.T @ np.array(means) @ self.basis
+    @cached_property
+    def everything(self) -> d_optimality.Candidates:
+        """All candidates for the use that is designed for."""
+        return self.candidates(self.use)
 
     def candidates(self, use: Use, name: str | None = None) -> d_optimality.Candidates:
         """The candidates of a set, or all, which are a common measure for designs from different sets.
 
         ConfigError when they leave part of the matrix undetermined.
         """
-        if (use, name) in self._candidates:
-            return self._candidates[use, name]
-        chosen = list(range(len(self.described)) if name is None else self.pool.sets[name])
-        information = self.information[use][chosen]
+        pool = self.pool
+        chosen = list(range(len(self.described)) if name is None else pool.sets[name])
         try:
-            self._candidates[use, name] = d_optimality.Candidates(information, self.costs[chosen], self.repetitions)
-        except ValueError:
-            mean = information.mean(axis=0)
-            scale = d_optimality.scale_of(mean)
-            weakest = np.linalg.eigh(mean * scale * scale[:, None])[1][:, 0] * scale
-            elements = (self.basis @ weakest).reshape(3, -1)
-            direction = np.linalg.svd(elements)[2][0]
+            return d_optimality.Candidates(self.information[use][chosen], self.costs[chosen], self.repetitions)
+        except d_optimality.UndeterminedError as error:
+            elements = (self.basis @ error.direction).reshape(3, -1)
+            direction = direction_in_words(np.linalg.svd(elements)[2][0], pool.robot.drive.names)
             row = int(np.argmax(np.linalg.norm(elements, axis=1))) + 1
-            poses = "the final poses" if use == "final" else "the poses"
             raise ConfigError(
-                f"{self.pool.source}: {poses} of {name or 'all commands'} leave row {row} of the matrix undetermined "
-                f"along {direction_in_words(direction, self.pool.robot.drive.names)}; add commands that determine it"
+                f"{pool.source}: {'the final poses' if use == 'final' else 'the poses'} of {name or 'all commands'} "
+                f"leave row {row} of the matrix undetermined along {direction}; add commands that determine it"
             ) from None
-        return self._candidates[use, name]
 
-    def of_all(self, name: str, counts: d_optimality.Counts) -> d_optimality.Counts:
+    def of_all(self, name: str, counts: Counts) -> Counts:
         """Counts of a set's candidates as counts (C,) of all."""
-        every: d_optimality.Counts = np.zeros(len(self.described), dtype=np.intp)
+        every: Counts = np.zeros(len(self.described), dtype=np.intp)
         every[list(self.pool.sets[name])] = counts
         return every
 
-    def effort(self, counts: d_optimality.Counts) -> Effort:
+    def effort(self, counts: Counts) -> Effort:
         """Time and distance of driving ``counts`` runs (C,) of the candidates."""
         sums = np.array([[run.duration_s, run.distance_m, run.rolled_m] for run in self.described]).T @ counts
         return Effort(runs=int(counts.sum()), seconds=sums[0], metres=sums[1], wheel_metres=sums[2])
 
-    def precision(self, counts: d_optimality.Counts) -> Precision:
+    def precision(self, counts: Counts) -> Precision:
         """Standard deviations that ``counts`` runs (C,) of the candidates give."""
-        everything = self.candidates(self.use)
+        robot, everything = self.pool.robot, self.everything
         covariance = self.basis @ everything.covariance(counts) @ self.basis.T
         deviations = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)).reshape(3, -1)
-        largest = self.pool.robot.row_scales
-        first, second, third = (100 * deviations.max(axis=1) / largest).tolist()
-        relative = math.sqrt(everything.root(self.pool.baseline) / everything.root(counts))
-        physical = None if self._physical is None else _physical_spread(self._physical, covariance, self.pool.robot)
+        first, second, third = (100 * deviations.max(axis=1) / robot.row_scales).tolist()
         return Precision(
             effort=self.effort(counts),
-            relative=relative,
+            relative=math.sqrt(everything.root(self.pool.baseline) / everything.root(counts)),
             row_percent=(first, second, third),
-            motions=tuple(_motion_precisions(self.pool.robot, covariance)),
-            physical=physical,
+            motions=tuple(_motion_precisions(robot, covariance)),
+            physical=None if self.physical is None else _physical_spread(self.physical, covariance, robot),
         )
 
-    def step(self, counts: d_optimality.Counts, bound: float) -> Step:
+    def step(self, counts: Counts, bound: float) -> Step:
         """The precision of ``counts`` (C,), with its efficiency as a share of ``bound``."""
-        efficiency = self.candidates(self.use).criterion(counts) / bound
-        return Step(**dict(self.precision(counts)), efficiency=efficiency)
+        return Step(**dict(self.precision(counts)), efficiency=self.everything.criterion(counts) / bound)
 
-    def chosen(self, counts: d_optimality.Counts) -> tuple[Chosen, ...]:
+    def chosen(self, counts: Counts) -> tuple[Chosen, ...]:
         """The commands that are driven at least once."""
-        return tuple(
-            Chosen(command=candidate.name, runs=int(count))
-            for candidate, count in zip(self.described, counts, strict=True)
-            if count
-        )
+        driven = np.flatnonzero(counts)
+        return tuple(Chosen(command=self.described[index].name, runs=int(counts[index])) for index in driven)
+
+    def equivalent(
+        self, name: str, use: Use, optimum: d_optimality.ContinuousDesign | None = None, designs: Sequence[Counts] = ()
+    ) -> Equivalent:
+        """The smallest design for a use that tells as much about the matrix as the baseline.
+
+        optimum, designs: made already for this use, designs from the smallest on; if none tells as much, one is made. A
+        use for which none are made may leave part of the matrix undetermined.
+        """
+        try:
+            own, everything = self.candidates(use, name), self.candidates(use)
+        except ConfigError:
+            return Equivalent(use=use, effort=None, least=None, chosen=())
+        optimum = optimum or d_optimality.continuous_optimum(own)
+        target = everything.root(self.pool.baseline)
+        counts = next((design for design in designs if everything.root(design) >= target), None)
+        if counts is None and (in_set := d_optimality.equal_design(own, optimum, target)) is not None:
+            counts = self.of_all(name, in_set)
+        effort, chosen = (None, ()) if counts is None else (self.effort(counts), self.chosen(counts))
+        return Equivalent(use=use, effort=effort, least=target / optimum.bound, chosen=chosen)
 
 
 def evenly(noise: Noise) -> Noise:
     """A noise model with equal figures (m, rad) for x, y and heading, as Eq. (6) weighs them: the RMS of the three."""
-    return Noise(
-        **{
-            f"{kind}_{coordinate}": math.sqrt(
-                (2 * getattr(noise, f"{kind}_position") ** 2 + getattr(noise, f"{kind}_heading") ** 2) / 3
-            )
-            for kind in ("pose", "walk", "bias")
-            for coordinate in ("position", "heading")
-        }
-    )
+    sizes = {}
+    for kind in ("pose", "walk", "bias"):
+        position, heading = getattr(noise, f"{kind}_position"), getattr(noise, f"{kind}_heading")
+        sizes[f"{kind}_position"] = sizes[f"{kind}_heading"] = math.sqrt((2 * position**2 + heading**2) / 3)
+    return Noise(**sizes)
 
 
 def _described(candidate: CandidateRun, robot: Robot) -> Candidate:
     first = candidate.runs[0]
     picks = np.unique(np.linspace(0, len(first.poses) - 1, _PATH_POINTS).round().astype(int))
     path = np.round(relative(first.start, first.poses[picks]), 5)
-    known = first.v is not None and first.alpha is not None and first.omega is not None
-    radii, runs = robot.radii, candidate.runs
-    rolled = [
-        float((np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None] * radii).sum() / len(radii)) for run in runs
-    ]
-    distance = first.distance  # as commanded, or else along the reference poses
-    if distance is None:
-        distance = np.mean([np.hypot(*np.diff(run.poses[:, :2], axis=0).T).sum() for run in runs])
+    angles = [(np.abs(run.rates) * np.diff(run.times, prepend=0.0)[:, None]).sum(axis=0) for run in candidate.runs]
     return Candidate(
         name=candidate.name,
-        speed=first.v if known else None,
-        direction=first.alpha if known else None,
-        turn_rate=first.omega if known else None,
+        speed=first.v,
+        direction=first.alpha,
+        turn_rate=first.omega,
         duration_s=candidate.duration,
-        distance_m=float(distance),
-        rolled_m=float(np.mean(rolled)),
+        distance_m=candidate.distance,
+        rolled_m=float(np.mean(angles * robot.radii)),
+        words=candidate.in_words,
         path=tuple((px, py, ph) for px, py, ph in path.tolist()),
     )
 
@@ -325,20 +337,8 @@ def _motion_precisions(robot: Robot, covariance: Array) -> Iterator[MotionPrecis
 def _physical_spread(slopes: Array, covariance: Array, robot: Robot) -> PhysicalSpread:
     deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)).reshape(3, -1)
     design = WheelGeometry(robot).start.reshape(3, -1)
-    return PhysicalSpread(
-        radius_percent=float((100 * deviations[0] / design[0]).max()),
-        distance_percent=float((100 * deviations[1] / design[1]).max()),
-        angle_deg=float(np.degrees(deviations[2]).max()),
-    )
-
-
-# Half of each of these numbers (or of the distance from 1) and twice choose the same runs of twelve commands
-# (tests/studies/constants_fit.py).
-# Share of the bound: the recommended design is the smallest that reaches it. The rest is worth 0.5 % of a deviation.
-GOOD_EFFICIENCY = 0.99
-_MOST_STEPS = 400  # runs: designs are listed up to the baseline's number, but no further than this
-_MOST_RUNS = 2000  # runs or repetitions that may be asked for: more are a slip of the pen
-_LEAST_SHARE = 1e-4  # a command with less of the continuous optimum is not listed: less than a run in 10,000
+    radius, distance = (100 * deviations[:2] / design[:2]).max(axis=1).tolist()
+    return PhysicalSpread(radius_percent=radius, distance_percent=distance, angle_deg=math.degrees(deviations[2].max()))
 
 
 def design_experiment(
@@ -366,27 +366,19 @@ def design_experiment(
     for name, number in (("runs", runs), ("repetitions", repetitions)):
         if number is not None:
             require_range(name, number, 1, _MOST_RUNS, whole=True)
-    if isinstance(source, CandidatePool):
-        pool = source
-    else:
-        pool = read_candidates(source, dataset=dataset, integration=integration)
+    pool = source
+    if not isinstance(pool, CandidatePool):
+        pool = read_candidates(pool, dataset=dataset, integration=integration)
     problem = DesignProblem(pool, use, per, repetitions)
     sets = tuple(_design_of_set(problem, name, runs) for name in pool.sets)
     return Design(
-        source=pool.source,
-        name=pool.name,
-        description=pool.description,
+        **{field: getattr(pool, field) for field in _OF_POOL},
         robot=pool.robot.name,
-        simulated=pool.simulated,
-        recorded=pool.recorded,
-        integration=pool.integration,
         use=use,
         per=per,
         runs_asked=runs,
         most_repetitions=repetitions,
         parameters=problem.basis.shape[1],
-        noise=pool.noise,
-        noise_source=pool.noise_source,
         candidates=problem.described,
         baseline=Baseline(name=pool.baseline_name, precision=problem.precision(pool.baseline)),
         sets=sets,
@@ -394,97 +386,52 @@ def design_experiment(
     )
 
 
+_OF_POOL = ("source", "name", "description", "simulated", "recorded", "integration", "noise", "noise_source")
+
+
 def _design_of_set(problem: DesignProblem, name: str, runs: int | None) -> SetDesign:
-    candidates = problem.candidates(problem.use, name)
+    """The design from a set: that of ``runs`` runs, else the smallest that is good enough, else the best."""
+    candidates, pool = problem.candidates(problem.use, name), problem.pool
     optimum = d_optimality.continuous_optimum(candidates)
-    baseline = problem.pool.baseline
-    most = max(min(max(int(baseline.sum()), 4 * candidates.parameters), _MOST_STEPS), runs or 0)
-    designs = [
-        problem.of_all(name, counts)
-        for counts in d_optimality.exact_designs(candidates, optimum, most)
-        if candidates.identifies(counts)
-    ]
+    most = max(min(max(int(pool.baseline.sum()), 4 * candidates.parameters), _MOST_STEPS), runs or 0)
+    exact = d_optimality.exact_designs(candidates, optimum, range(1, most + 1))
+    designs = [problem.of_all(name, counts) for counts in exact if candidates.identifies(counts)]
     steps = [problem.step(counts, optimum.bound) for counts in designs]
-    chosen = _wanted(steps, runs, f"{problem.pool.source}: {name}")
-    commands = [problem.described[index].name for index in problem.pool.sets[name]]
-    shares = zip(commands, optimum.shares.tolist(), strict=True)
+    numbers = [step.effort.runs for step in steps]
+    if not steps or (runs is not None and runs not in numbers):
+        wanted = "no number of runs can" if runs is None else f"{plural(runs, 'run')} cannot"
+        span = f"from {numbers[0]} to {numbers[-1]} can" if numbers else "allow more runs or repetitions"
+        raise ConfigError(f"{pool.source}: {name}: {wanted} be chosen so that they identify the matrix; {span}")
+    best = max(steps, key=lambda step: min(step.efficiency, GOOD_EFFICIENCY))  # the first of those that are good
+    chosen = steps.index(best) if runs is None else numbers.index(runs)
+    commands = [problem.described[index].name for index in pool.sets[name]]
+    shares = {
+        command: float(share) for command, share in zip(commands, optimum.shares, strict=True) if share > _LEAST_SHARE
+    }
     made = {problem.use: (optimum, designs)}
     return SetDesign(
         name=name,
         commands=tuple(commands),
-        optimum=Optimum(
-            shares={command: share for command, share in shares if share > _LEAST_SHARE},
-            gap=optimum.gap,
-            iterations=optimum.iterations,
-        ),
+        optimum=Optimum(shares=shares, gap=optimum.gap, iterations=optimum.iterations),
         chosen=problem.chosen(designs[chosen]),
         step=steps[chosen],
         reached=steps[chosen].efficiency >= GOOD_EFFICIENCY,
-        baseline_efficiency=problem.candidates(problem.use).criterion(baseline) / optimum.bound,
+        baseline_efficiency=problem.everything.criterion(pool.baseline) / optimum.bound,
         steps=tuple(steps),
-        equivalents=tuple(_equal(problem, name, use, *made.get(use, ())) for use in USES),
+        equivalents=tuple(problem.equivalent(name, use, *made.get(use, ())) for use in USES),
     )
 
 
-def _wanted(steps: Sequence[Step], runs: int | None, place: str) -> int:
-    """Index of the recommended step: the one with ``runs``, else the first that is good enough, else the best."""
-    if runs is None:
-        good = [index for index, step in enumerate(steps) if step.efficiency >= GOOD_EFFICIENCY]
-        if not steps:
-            raise ConfigError(f"{place}: no design that the repetitions allow identifies the matrix; allow more")
-        return good[0] if good else max(range(len(steps)), key=lambda index: steps[index].efficiency)
-    for index, step in enumerate(steps):
-        if step.effort.runs == runs:
-            return index
-    possible = [step.effort.runs for step in steps]
-    span = f"from {possible[0]} to {possible[-1]} can" if possible else "none can"
-    raise ConfigError(f"{place}: {plural(runs, 'run')} cannot be chosen so that they identify the matrix; {span}")
-
-
-def _equal(
-    problem: DesignProblem,
-    name: str,
-    use: Use,
-    optimum: d_optimality.ContinuousDesign | None = None,
-    designs: Sequence[d_optimality.Counts] = (),
-) -> Equivalent:
-    """The smallest design for a use that tells as much about the matrix as the baseline.
-
-    optimum, designs: made already for this use, designs from the smallest on; the first that tells as much is taken; if
-    none does, one is made. A use for which none are made may leave part of the matrix undetermined.
-    """
-    if optimum is None:
-        try:
-            optimum = d_optimality.continuous_optimum(problem.candidates(use, name))
-        except ConfigError:
-            return Equivalent(use=use, effort=None, least=None, chosen=())
-    everything = problem.candidates(use)
-    target = everything.root(problem.pool.baseline)
-    counts = next((design for design in designs if everything.root(design) >= target), None)
-    if counts is None:
-        in_set = d_optimality.equal_design(problem.candidates(use, name), optimum, target)
-        counts = None if in_set is None else problem.of_all(name, in_set)
-    return Equivalent(
-        use=use,
-        effort=None if counts is None else problem.effort(counts),
-        least=target / optimum.bound,
-        chosen=() if counts is None else problem.chosen(counts),
-    )
-
-
-def _remarks(pool: CandidatePool, use: Use, per: Per) -> tuple[str, ...]:
+def _remarks(pool: CandidatePool, use: Use, per: Per) -> Iterator[str]:
     """Assumptions behind the numbers."""
     logs = "as recorded" if pool.recorded else "as the design values command them"
-    remarks = [
+    yield (
         f"Information is that of the matrix elements at the robot's design values, with wheel rates {logs} and taken "
-        "as exact; the design is optimal for robots near them.",
-        "It assumes that one matrix is the whole truth. To find what a matrix cannot express (slip, speed or direction "
-        "dependence), drive other commands too.",
-        "Exact designs are found by adding the run that gains most and by exchange, and are local optima; the bound "
-        "says how far from the best they can be.",
-    ]
+        "as exact. It assumes that one matrix is the whole truth: to find what a matrix cannot express (slip, speed or "
+        "direction dependence), drive other commands too."
+    )
+    yield "Exact designs are found by exchange, and are local optima; the bound says how far from the best they can be."
     if per == "run":
-        remarks.append("A run counts as a run however long it is; --per second or --per metre makes long ones dear.")
+        yield "A run counts as a run however long it is; --per second or --per metre makes long ones dear."
     if use == "final":
-        remarks.append("Only the final pose of a run is used, with the same noise in m and rad, as Eq. (6) weighs it.")
-    return tuple(remarks)
+        yield "Only the final pose of a run is used, with the same noise in m and rad, as Eq. (6) weighs it."

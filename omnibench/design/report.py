@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import plotly.graph_objects as go
@@ -16,19 +16,9 @@ from omnibench.design.candidates import Per, Use
 from omnibench.design.design import Candidate, Design, Effort, Precision, SetDesign
 from omnibench.report import blocks as page
 from omnibench.report.figures import ORIGIN, line, marks
-from omnibench.report.numbers import (
-    NOTHING,
-    count,
-    fixed,
-    listing,
-    motion_in_words,
-    noise_in_words,
-    percent,
-    significant,
-)
+from omnibench.report.numbers import NOTHING, count, fixed, listing, noise_in_words, percent, significant
 from omnibench.report.result import NextStep, Remark, Result
 from omnibench.report.style import INK, PALETTE, QUIET, logarithmic, plan, plot, text
-from omnibench.robot.kinematics import Array
 from omnibench.words import plural
 
 _USES: Mapping[Use, str] = {"final": "final poses", "trajectory": "whole trajectories"}
@@ -80,13 +70,14 @@ class DesignResult(Result):
     def document(self) -> page.Document:
         design = self.design
         tiles, plans, chosen = list[page.Fact](), list[page.Block](), list[page.Block]()
+        baseline = count(design.baseline.precision.effort.runs)
         for of_set in design.sets:
-            effort, equal = of_set.step.effort, of_set.equivalent(design.use).effort
+            effort = of_set.step.effort
             share = f"{percent(of_set.step.efficiency, 2)} of the bound; {_duration(effort.seconds)}"
             tiles.append(page.Fact(f"{of_set.name}: chosen", plural(effort.runs, "run"), share))
-            baseline = f"{of_set.name}: equal to the baseline's {count(design.baseline.precision.effort.runs)}"
+            equal = next(each.effort for each in of_set.equivalents if each.use == design.use)
             runs, driven = ("none", "") if equal is None else (plural(equal.runs, "run"), _duration(equal.seconds))
-            tiles.append(page.Fact(baseline, runs, driven))
+            tiles.append(page.Fact(f"{of_set.name}: equal to the baseline's {baseline}", runs, driven))
             if not design.recorded:
                 plans.append(page.Callout(f"What to drive of {of_set.name}", what_to_drive(design, of_set)))
             chosen += [chosen_table(design, of_set), page.Paragraph(left_open(of_set))]
@@ -130,32 +121,9 @@ class DesignResult(Result):
         return self.design
 
 
-def command_in_words(candidate: Candidate) -> str:
-    return motion_in_words(candidate.name, candidate.speed, candidate.direction, candidate.turn_rate)
-
-
-def _driven(candidate: Candidate) -> str:
-    """A command as a person drives it: ``forward 2 m at 0.5 m/s, turning left by 90° with radius 1.2 m``."""
-    speed, direction, rate = candidate.speed, candidate.direction, candidate.turn_rate
-    if speed is None or direction is None or rate is None:
-        return candidate.name
-    turned = math.degrees(abs(rate) * candidate.duration_s)
-    turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
-    side = "left" if rate > 0 else "right"
-    if not speed:
-        return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
-    degrees = round(math.degrees(direction), 3) % 360
-    aside = f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {'left' if degrees < 180 else 'right'} of forward,"
-    ways = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}
-    length = f"{significant(candidate.distance_m, 2)} m at {significant(speed, 2)} m/s"
-    turning = f", turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m" if rate else ""
-    return f"{ways.get(degrees, aside)} {length}{turning}"
-
-
 def what_to_drive(design: Design, of_set: SetDesign) -> tuple[str, ...]:
     """What to drive of a set, a line for each chosen command, with how often."""
-    drives = ((_driven(design.candidate(chosen.command)), chosen.runs) for chosen in of_set.chosen)
-    return tuple(f"{drive}, {plural(runs, 'time')}" for drive, runs in drives)
+    return tuple(f"{design.candidate(each.command).words}, {plural(each.runs, 'time')}" for each in of_set.chosen)
 
 
 def left_open(of_set: SetDesign) -> str:
@@ -183,17 +151,11 @@ def _effort(effort: Effort) -> str:
     return f"{plural(effort.runs, 'run')}, {_duration(effort.seconds)}, {significant(effort.metres, 3)} m"
 
 
-_LEFT = page.LegendItem("left", "turning left", PALETTE[0])
-_STRAIGHT = page.LegendItem("straight", "straight", "#5b6772")
-# Left and right turns may run along the same circle: dashes over a line show both.
-_RIGHT = page.LegendItem("right", "turning right", PALETTE[1], "dash")
+_CHOSEN = page.LegendItem("chosen", "chosen", PALETTE[0])
 _UNUSED = page.LegendItem("unused", "candidates not chosen", "#d4d9df")
 _ASSUMED = page.Badge("ASSUMED NOISE, NO RECORDINGS", "warning")
 _BASELINE = page.LegendItem("", "baseline", QUIET, symbol="diamond")
-# rad: a run that turns by less is drawn as straight; nothing else hangs on it. Before calibration the simulated APR-02
-# seems to turn by 0.1 to 2.7 degrees in six straight runs: five are drawn as straight, three with half of it and six
-# with twice (tests/studies/constants_fit.py).
-_STRAIGHT_BELOW = math.radians(2)
+_MOST_TURN = math.radians(330)  # of an arc that stands for turning on the spot: more would close it
 _HEIGHT = 380  # px: the paths end within the first 900 of the page
 
 
@@ -208,21 +170,18 @@ def path_figures(design: Design) -> page.FigureGrid:
         )
         for of_set in design.sets
     )
-    drawn = {trace.legendgroup for figure in figures for trace in figure.plot.data}
-    return page.FigureGrid(
-        figures,
-        tuple(item for item in (_LEFT, _STRAIGHT, _RIGHT, _UNUSED) if item.key in drawn),
-        2 if len(figures) > 1 else 1,
+    caption = (
         "All paths start at the origin, heading along x, and end at the dot. The more often a command is driven, the "
-        "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin.",
-        "what-to-drive",
     )
+    caption += "wider its line (and its number stands at its end). Turns on the spot are arcs about the origin."
+    return page.FigureGrid(figures, (_CHOSEN, _UNUSED), 2 if len(figures) > 1 else 1, caption, "what-to-drive")
 
 
 def precision_figure(design: Design) -> page.FigureGrid:
     """Standard deviations of the best runs found against their number, with a ring around the chosen ones."""
-    baseline, traces = design.baseline.precision.effort.runs, []
-    for of_set, item in zip(design.sets, legend := _legend(design), strict=True):
+    baseline, traces, legend = design.baseline.precision.effort.runs, [], []
+    for of_set, colour in zip(design.sets, cycle(PALETTE)):
+        legend.append(item := page.LegendItem(of_set.name, of_set.name, colour))
         words = [
             f"{of_set.name}, {_effort(step.effort)}, {percent(step.efficiency, 2)} of the bound"
             for step in of_set.steps
@@ -241,49 +200,32 @@ def precision_figure(design: Design) -> page.FigureGrid:
     about = "Geometric mean of the standard deviations against the number of runs, on logarithmic scales"
     caption = "One standard deviation of the best unbiased estimate (the Cramér-Rao bound). Ring: the chosen design; "
     caption += "diamond: the baseline."
-    return page.FigureGrid((page.Figure(title, figure, about),), legend, 1, caption)
-
-
-def _legend(design: Design) -> tuple[page.LegendItem, ...]:
-    colours = cycle(PALETTE)
-    return tuple(page.LegendItem(of_set.name, of_set.name, next(colours)) for of_set in design.sets)
+    return page.FigureGrid((page.Figure(title, figure, about),), tuple(legend), 1, caption)
 
 
 def _flower(design: Design, of_set: SetDesign) -> go.Figure:
     counts: Mapping[str, int] = {chosen.command: chosen.runs for chosen in of_set.chosen}
-    candidates = [design.candidate(name) for name in of_set.commands]
+    candidates = sorted(map(design.candidate, of_set.commands), key=lambda each: (each.name in counts, -each.turned))
     reaches = {each.name: max(math.hypot(x, y) for x, y, _ in each.path) for each in candidates}
     spots, reach = [name for name, farthest in reaches.items() if farthest < 0.01], max(reaches.values()) or 1.0
     traces = []
-    for candidate in sorted(candidates, key=lambda command: (counts.get(command.name, 0) > 0, -_turned(command))):
-        points = np.array(candidate.path)[:, :2]
-        if candidate.name in spots:  # a turn on the spot is drawn as an arc about the origin of at most 330 deg
-            turned = math.copysign(min(abs(_turned(candidate)), math.radians(330)), _turned(candidate))
-            angles = np.linspace(0.0, turned, 60)
+    for candidate in candidates:
+        points, runs = np.array(candidate.path)[:, :2], counts.get(candidate.name, 0)
+        if candidate.name in spots:  # a turn on the spot is drawn as an arc about the origin
+            angles = np.linspace(
+                0.0, math.copysign(min(abs(candidate.turned), math.radians(330)), candidate.turned), 60
+            )
             radius = reach * (0.1 + 0.3 * spots.index(candidate.name) / len(spots))
             points = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        traces += _path(candidate, points, counts.get(candidate.name, 0))
+        hover = f"{text(candidate.motion)}, {candidate.duration_s:.3g} s: {plural(runs, 'run')}"
+        width = min(2.0 + 1.2 * runs, 14.0) if runs else 1.0
+        traces.append(line(_CHOSEN if runs else _UNUSED, width, *points.T, hover=hover))
+        if runs:
+            number: dict[str, Any] = {"mode": "markers+text", "text": [f"<b>{runs}×</b>"]} if runs > 1 else {}
+            number |= {"textposition": "top center" if points[-1, 1] >= 0 else "bottom center", "cliponaxis": False}
+            number |= {"textfont": {"size": 13, "color": INK}}
+            traces.append(marks(_CHOSEN, width + 5, *points[-1:].T, hover=hover, **number))
     return plan(*traces, marks(ORIGIN, 7, [0], [0], hover="start"))
-
-
-def _path(candidate: Candidate, points: Array, runs: int) -> list[go.Scatter]:
-    turned = _turned(candidate)
-    hover = f"{text(command_in_words(candidate))}, {candidate.duration_s:.3g} s: {plural(runs, 'run')}"
-    if not runs:
-        return [line(_UNUSED, 1, *points.T, hover=hover)]
-    item = _STRAIGHT if abs(turned) < _STRAIGHT_BELOW else _LEFT if turned > 0 else _RIGHT
-    width = min(2.0 + 1.2 * runs, 14.0)
-    end: dict[str, Any] = {"mode": "markers+text", "text": [f"<b>{runs}×</b>"]} if runs > 1 else {}
-    end |= {"textposition": "top center" if points[-1, 1] >= 0 else "bottom center", "cliponaxis": False}
-    return [
-        line(item, width, *points.T, hover=hover),
-        marks(item, width + 5, *points[-1:].T, hover=hover, textfont={"size": 13, "color": INK}, **end),
-    ]
-
-
-def _turned(candidate: Candidate) -> float:
-    """The angle that a run turns by, rad; positive to the left."""
-    return candidate.path[-1][2] - candidate.path[0][2]
 
 
 # Designs in the table against the number of runs, beside the chosen one and the baseline. Only the table's length hangs
@@ -295,25 +237,23 @@ _COMMAND_COLUMNS = page.columns("Command", "Duration (s)", "Distance (m)", page.
 def equal_table(design: Design) -> page.Table:
     """The smallest designs that give as much information as the baseline, set by set."""
     rows = []
-    for of_set in design.sets:
-        for equal in of_set.equivalents:
-            effort = equal.effort
-            # A lower bound to a tenth, rounded down so that it stays one
-            least = NOTHING if equal.least is None else fixed(math.floor(10 * equal.least) / 10, 1)
-            left = "they leave part of the matrix undetermined"
-            reason = left if equal.least is None else "not within the repetitions allowed"
-            cells: tuple[page.Cell | str, ...] = (page.Cell(NOTHING, reason), NOTHING, NOTHING)
-            if effort is not None:
-                cells = (count(effort.runs), _duration(effort.seconds), f"{significant(effort.metres, 3)} m")
-            rows.append(page.Row.of(of_set.name, _USES[equal.use], *cells, least))
+    for of_set, equal in ((each, equal) for each in design.sets for equal in each.equivalents):
+        # A lower bound to a tenth, rounded down so that it stays one
+        least = NOTHING if equal.least is None else fixed(math.floor(10 * equal.least) / 10, 1)
+        left = "they leave part of the matrix undetermined"
+        reason = left if equal.least is None else "not within the repetitions allowed"
+        cells: tuple[page.Cell | str, ...] = (page.Cell(NOTHING, reason), NOTHING, NOTHING)
+        if (effort := equal.effort) is not None:
+            cells = (count(effort.runs), _duration(effort.seconds), f"{significant(effort.metres, 3)} m")
+        rows.append(page.Row.of(of_set.name, _USES[equal.use], *cells, least))
     use, bound = page.Column("Calibrated from", numeric=False), page.Column("Bound", _UNITS[design.per])
     return page.Table(
         f"As good as the baseline: {design.baseline.name} ({_effort(design.baseline.precision.effort)})",
         page.columns("Candidates", use, "Runs", "Time", "Distance", bound),
         tuple(rows),
         "The smallest design found whose det(information)^(1/p) is at least the baseline's; no design at all can do "
-        "it with less than the bound in the last column. Final poses are taken as Eq. (6) does, with equal noise in m "
-        "and rad; whole trajectories by every reference pose under the noise model.",
+        "it with less than the bound. Final poses are taken as Eq. (6) does, with equal noise in m and rad; whole "
+        "trajectories by every reference pose under the noise model.",
     )
 
 
@@ -323,35 +263,27 @@ def chosen_table(design: Design, of_set: SetDesign) -> page.Table:
     for chosen in of_set.chosen:
         share = percent(of_set.optimum.shares.get(chosen.command, 0.0))
         rows.append(page.Row.of(*_command_cells(design.candidate(chosen.command)), count(chosen.runs), share))
-    optimum = page.Column("Continuous optimum", "share", priority=1)
     return page.Table(
         f"What to drive of {of_set.name}: {_effort(of_set.step.effort)}",
-        (*_COMMAND_COLUMNS, page.Column("Runs"), optimum),
+        (*_COMMAND_COLUMNS, page.Column("Runs"), page.Column("Continuous optimum", "share", priority=1)),
         tuple(rows),
         "Other choices may be as good: turning all directions of a design by the same angle often changes nothing.",
     )
 
 
 def _command_cells(candidate: Candidate) -> tuple[page.Cell, ...]:
-    words = command_in_words(candidate)
     lengths = (candidate.duration_s, candidate.distance_m, candidate.rolled_m)
-    return (
-        page.Cell(words, "" if candidate.name == words else candidate.name),
-        *(page.Cell(fixed(each, 2)) for each in lengths),
-    )
+    note = "" if candidate.name == candidate.motion else candidate.name
+    return page.Cell(candidate.motion, note), *(page.Cell(fixed(each, 2)) for each in lengths)
 
 
 def effort_table(design: Design, of_set: SetDesign) -> page.Table:
     """The precision against the number of runs: some of a set's best designs, the chosen one, and the baseline."""
-    first, last = of_set.steps[0].effort.runs, of_set.steps[-1].effort.runs
+    first, last, chosen = of_set.steps[0].effort.runs, of_set.steps[-1].effort.runs, of_set.step.effort.runs
     wanted = [first * (last / first) ** (index / (_ROWS - 1)) for index in range(_ROWS)]
     shown = {min(of_set.steps, key=lambda step: abs(step.effort.runs - runs)).effort.runs for runs in wanted}
-    chosen = of_set.step.effort.runs
-    rows = [
-        _precision_row(step.efficiency, step, "best" if step.effort.runs == chosen else "plain")
-        for step in of_set.steps
-        if step.effort.runs in shown | {chosen}
-    ]
+    steps = [step for step in of_set.steps if step.effort.runs in shown | {chosen}]
+    rows = [_precision_row(step.efficiency, step, step.effort.runs == chosen and "best") for step in steps]
     rows.append(_precision_row(of_set.baseline_efficiency, design.baseline.precision, "muted"))
     physical = [page.Column(*kind, priority=1) for kind in (("Radius", "%"), ("Distance", "%"), ("Angle", "°"))]
     of_rows = (f"Row {number} (% of largest)" for number in (1, 2, 3))
@@ -364,11 +296,9 @@ def effort_table(design: Design, of_set: SetDesign) -> page.Table:
     )
 
 
-def _precision_row(efficiency: float, precision: Precision, role: page.RowRole) -> page.Row:
-    values = list(precision.row_percent)
-    if precision.physical is not None:
-        spread = precision.physical
-        values += [spread.radius_percent, spread.distance_percent, spread.angle_deg]
-    runs, seconds = count(precision.effort.runs), _duration(precision.effort.seconds)
+def _precision_row(efficiency: float, precision: Precision, role: page.RowRole | Literal[False]) -> page.Row:
+    spread, runs = precision.physical, precision.effort.runs
+    values = [*precision.row_percent, *(() if spread is None else spread.model_dump().values())]
     numbers = (f"× {significant(precision.relative, 3)}", *(significant(value, 3) for value in values))
-    return page.Row.of(percent(efficiency, 2), runs, seconds, *numbers, role=role)
+    cells = (percent(efficiency, 2), count(runs), _duration(precision.effort.seconds), *numbers)
+    return page.Row.of(*cells, role=role or "plain")

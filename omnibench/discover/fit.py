@@ -17,6 +17,7 @@ The covariance of matrix elements and parameters is that of the noise, or of the
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -109,11 +110,10 @@ def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> Plain
         start = calibration.matrix_without_effects
     recorded = dataset.split("train")
     runs = thinned(fits.usable_runs(in_windows([run for run in recorded if run.has_poses]) or recorded))
-    try:
-        repeating = reference_noise.repeating_runs(runs, dataset.split("validation"))
-        repeating = thinned(fits.usable_runs(repeating, "validation"))
-    except DataError:
-        repeating = ()
+    repeating: tuple[Trajectory, ...] = ()
+    with suppress(DataError):  # none is usable
+        others = reference_noise.repeating_runs(runs, dataset.split("validation"))
+        repeating = thinned(fits.usable_runs(others, "validation"))
     return PlainFit(dataset, fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating))
 
 

@@ -98,14 +98,12 @@ def information_of_runs(
 
 
 def _informations(odometry: OdometryBatch, logs: Sequence[WheelLog], matrix: Array, noise: Noise) -> Array:
-    """Fisher information (Z, 3N, 3N) of logs."""
-    information = np.empty((len(logs), matrix.size, matrix.size))
-    jacobians = split_by(odometry.jacobian(matrix), [log.stamps for log in logs])
-    for of_run, log, jacobian in zip(information, logs, jacobians, strict=True):
-        whitened = noises.Whitener(noise, log.stamps)(jacobian.reshape(len(jacobian), 3, -1))
-        columns = whitened.reshape(-1, whitened.shape[-1])
-        of_run[:] = columns.T @ columns
-    return information
+    """Fisher information (Z, 3N, 3N) of logs, as of columns that are whitened without any nuisances."""
+    stamps = [log.stamps for log in logs]
+    jacobian = odometry.jacobian(matrix)
+    columns = split_by(jacobian.reshape(len(jacobian), 3, -1), stamps)
+    residuals, slopes = [np.zeros((len(of), 3)) for of in stamps], [np.zeros((len(of), 3, 0)) for of in stamps]
+    return whitened(residuals, columns, noises.whiteners(noise, stamps), slopes, np.zeros(0)).information_of_runs
 
 
 def without_jumps(

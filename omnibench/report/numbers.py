@@ -12,7 +12,7 @@ from omnibench.report.blocks import LegendItem
 
 if TYPE_CHECKING:
     from omnibench.robot.calibration import Noise
-
+from omnibench.words import plural
 
 NOTHING = "–"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -137,6 +137,30 @@ def motion_in_words(name: str, speed: float | None, direction: float | None, tur
     if speed == 0:
         return f"on the spot, {turn}"
     return f"{speed:.3g} m/s at {fixed(math.degrees(direction) % 360, 0)}°, {turn if turn_rate else 'straight'}"
+
+
+_WAYS = {0.0: "forward", 90.0: "sideways to the left", 180.0: "backward", 270.0: "sideways to the right"}  # deg
+
+
+def drive_in_words(
+    name: str, speed: float | None, direction: float | None, rate: float | None, seconds: float, metres: float
+) -> str:
+    """A command as a person drives it: ``forward 2 m at 0.5 m/s, turning left by 90° with radius 1.2 m``.
+
+    Its name if speed, m/s, direction, rad, or rate of turn, rad/s, are not known.
+    """
+    if speed is None or direction is None or rate is None:
+        return name
+    turned = math.degrees(abs(rate) * (metres / speed if speed else seconds))
+    turns = plural(round(turned / 360), "full turn") if turned > 359 else f"{fixed(turned, 0)}°"
+    side = "left" if rate > 0 else "right"
+    if not speed:
+        return f"on the spot {turns} to the {side} at {significant(abs(rate), 2)} rad/s"
+    degrees = round(math.degrees(direction), 3) % 360
+    aside = f"at {fixed(min(degrees, 360 - degrees), 0)}° to the {'left' if degrees < 180 else 'right'} of forward,"
+    length = f"{significant(metres, 2)} m at {significant(speed, 2)} m/s"
+    turning = f", turning {side} by {turns} with radius {significant(speed / abs(rate), 2)} m" if rate else ""
+    return f"{_WAYS.get(degrees, aside)} {length}{turning}"
 
 
 def moves(run: Trajectory) -> bool:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -216,6 +216,25 @@ class MotionGrid(Model):
         ]
 
 
+class CommandGrid(MotionGrid):
+    """A grid of commands: every direction with every turn rate, at each speed."""
+
+    distance: Positive | None = Field(None, description="length of each run, m; or give duration")
+    duration: Positive | None = Field(None, description="duration of each run that is not a turn on the spot, s")
+
+    @model_validator(mode="after")
+    def _length_is_given(self) -> CommandGrid:
+        if any(self.speeds) and (self.distance is None) == (self.duration is None):
+            raise ValueError("give the length of the runs: either distance (m) or duration (s)")
+        return self
+
+    def commands(self, robot: Robot) -> Iterator[TimedCommand]:
+        """The commands in the order of the grid. ValueError: the robot's wheels do not roll in a direction."""
+        for command in self.grid(robot):
+            driven = self.duration or (self.distance or 0.0) / max(command.speed, 1e-9)
+            yield TimedCommand(command, driven if command.speed else self.turn_duration)
+
+
 class SingleCommand(Model):
     """One command with its own duration."""
 
@@ -239,6 +258,13 @@ class SingleCommand(Model):
     def commands(self, robot: Robot) -> Iterator[TimedCommand]:
         """The one command, as a grid has many. ValueError as for ``command``."""
         yield TimedCommand(self.command(robot), self.duration)
+
+    @classmethod
+    def of(cls, timed: TimedCommand, digits: int = 12, **fields: Any) -> Self:
+        """A command as a config lists it. digits: decimals of its rate of turn, rad/s. fields: further ones."""
+        command, degrees = timed.command, round(math.degrees(timed.command.direction), 6)
+        rate = round(command.turn_rate, digits)
+        return cls(speed=command.speed, direction_deg=degrees, turn_rate=rate, duration=timed.duration, **fields)
 
 
 class ListedCommand(SingleCommand):
@@ -296,7 +322,7 @@ class DrivableCommands:
     """Limits of a robot, and the commands within them.
 
     max_speed: m/s. max_turn_rate, max_wheel_rate: rad/s. steering_limit: rad. free: sides of the floor that the robot's
-    centre may be in, m.
+    centre may be in, m. ramp: of every run, s, which makes it longer. variation: of every command within its run.
     """
 
     robot: Robot
@@ -306,16 +332,27 @@ class DrivableCommands:
     steering_limit: float
     free: tuple[float, float]
     shapes: Shapes
+    ramp: float = 0.0
+    variation: Variation = STEADY
 
     def __iter__(self) -> Iterator[TimedCommand]:
         """Lines, arcs to both sides and turns on the spot, each as fast as the limits and the pace allow."""
+        for command, duration in self._steady():
+            extremes = self.variation.extremes(command)
+            if all(is_within(self.robot, extreme, self.steering_limit) for extreme in extremes):
+                # A person times a run with ramps to a tenth of a second
+                seconds = round(duration + self.ramp, 1) if self.ramp else duration
+                yield TimedCommand(command, seconds, self.ramp, self.variation)
+
+    def _steady(self) -> Iterator[tuple[Command, float]]:
+        """The commands with their durations, s, without ramps."""
         _, pivot = straight_and_pivot(self.robot)
         for pace in self.shapes.paces:
             for direction in map(math.radians, default_directions(self.robot)):
                 if line := self._drivable(direction, 0.0, pivot, pace):
                     longest = min(max(self.free), LONGEST * line.speed)
                     for share in self.shapes.lines:
-                        yield TimedCommand(line, rounded_down(share * longest) / line.speed)
+                        yield line, rounded_down(share * longest) / line.speed
                 for radius, side in product(self._radii(direction, pivot), (1.0, -1.0)):
                     if arc := self._drivable(direction, side / radius, pivot, pace):
                         durations = [math.radians(turn) * radius / arc.speed for turn in self.shapes.turns]
@@ -354,7 +391,7 @@ class DrivableCommands:
         limits += [self.max_turn_rate / abs(command.turn_rate)] if command.turn_rate else []
         return float(min(limits))
 
-    def _of_length(self, command: Command, durations: list[float]) -> Iterator[TimedCommand]:
+    def _of_length(self, command: Command, durations: list[float]) -> Iterator[tuple[Command, float]]:
         """The command for those durations, s, that are neither too short or long nor lead out of the area, from some
         start and heading."""
         for duration in durations:
@@ -365,7 +402,7 @@ class DrivableCommands:
             turned = (path[:, 0] + 1j * path[:, 1]) * np.exp(1j * _HEADINGS)[:, None]
             wide, deep = np.ptp(turned.real, axis=1), np.ptp(turned.imag, axis=1)
             if ((wide <= self.free[0] + 1e-9) & (deep <= self.free[1] + 1e-9)).any():
-                yield TimedCommand(command, duration)
+                yield command, duration
 
 
 def rounded_down(value: float, digits: int = 2) -> float:

@@ -22,6 +22,7 @@ from omnibench.design.design import Design, SetDesign, design_experiment
 from omnibench.design.report import what_to_drive
 from omnibench.errors import ConfigError, DataError, OmnibenchError
 from omnibench.fit.trajectory_fit import information_of_runs
+from omnibench.robot.calibration import Noise
 from omnibench.robot.kinematics import Array
 from omnibench.simulate.config import FlowerConfig
 from omnibench.simulate.source import simulate_dataset
@@ -259,7 +260,7 @@ def test_final_poses_of_full_turns_are_said_to_leave_the_matrix_undetermined(tmp
     with pytest.raises(ConfigError, match=r"the final poses of star leave row [12] of the matrix undetermined along"):
         design_experiment(path, use="final")
     design = design_experiment(path, use="trajectory")
-    assert set_of(design, "star").equivalent("final").least is None
+    assert set_of(design, "star").equivalents[0].least is None
     assert set_of(design, "star").reached
 
 
@@ -323,7 +324,8 @@ def test_a_command_with_two_durations_is_two_candidates() -> None:
     assert [each.duration for each in config.commands("two")] == [3, 6]
 
 
-AREA = (4.5, 3.5)
+AREA = "4.5x3.5"
+SIDES = (4.5, 3.5)  # m
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -333,7 +335,8 @@ def file_of(folder: Path, name: str) -> Path:
 
 
 def pool_of(name: str, **limits: object) -> candidates.CandidatePool:
-    return candidates.RobotCommands.model_validate({"robot": robot(name), "area": AREA, **limits}).pool(name)
+    config = candidates.RobotLimits.model_validate({"area": AREA, **limits}).config(robot(name), name)
+    return candidates.candidates_of_config(config)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -352,7 +355,7 @@ def test_candidates_stay_within_speed_wheels_steering_and_the_area(name: str) ->
             assert np.degrees(np.abs(run.steering)).max() <= {"tricycle": 80, "car": 35, "swerve": 90}[name] + 1e-4
         places = (run.poses[:, 0] + 1j * run.poses[:, 1]) * turns
         sides = np.ptp(places.real, axis=1), np.ptp(places.imag, axis=1)
-        assert ((sides[0] <= AREA[0] - 2 * half + 0.01) & (sides[1] <= AREA[1] - 2 * half + 0.01)).any()
+        assert ((sides[0] <= SIDES[0] - 2 * half + 0.01) & (sides[1] <= SIDES[1] - 2 * half + 0.01)).any()
 
 
 @pytest.mark.parametrize("name", ["diff", *slow("tricycle", "car")])
@@ -371,10 +374,9 @@ def test_a_few_runs_are_chosen_and_told_as_a_person_drives_them(name: str) -> No
 
 
 def test_what_the_matrix_leaves_grows_with_the_noise_of_the_reference() -> None:
-    noise = {"pose_position": 0.005, "pose_heading": 0.005}
     once, twice = (
-        design_experiment(pool_of("diff", noise={key: scale * value for key, value in noise.items()}), runs=6)
-        for scale in (1, 2)
+        design_experiment(replace(pool_of("diff"), noise=Noise(pose_position=size, pose_heading=size)), runs=6)
+        for size in (0.005, 0.01)
     )
     for small, large in zip(once.sets[0].step.motions, twice.sets[0].step.motions, strict=True):
         assert large.position_mm == pytest.approx(2 * small.position_mm)
@@ -389,7 +391,7 @@ def test_the_command_prints_what_to_drive_and_how_precise_it_will_be(command: Co
     assert "What to drive:\n  forward " in printed
     assert "sideways to the left " in printed
     assert "Calibrated from these runs, the matrix leaves an error of" in printed
-    assert "noise assumed: 10 mm and 0.29 deg of each reference pose" in printed
+    assert "noise assumed: positions white 10 mm, walk 3.0 mm/√s, headings white 0.29°" in printed
     report = Path("design/report.html").read_text(encoding="utf-8")
     assert 0 < report.index("<h4>What to drive of ") < report.index("<h2>Chosen commands")
 
@@ -415,21 +417,21 @@ def test_a_design_config_lists_commands_for_a_robot_that_steers_within_its_limit
         ("diff", {"area": "0x3"}, "--area 0x3"),
         ("diff", {"area": "0.5x3"}, "--area 0.5x3: the robot alone takes 0.4 m"),
         ("diff", {"max_speed": 5.0, "max_wheel_rate": 20.0}, "--max-speed 5: at --max-wheel-rate 20 rad/s"),
-        ("diff", {"max_speed": -1.0}, "--max-speed -1"),
+        ("diff", {"max_speed": -1.0}, "max_speed: Input should be greater than 0"),
         ("diff", {"steering_limit": 30.0}, "--steering-limit"),
         ("car", {"area": "2x2"}, "no curve that it can drive"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(name: str, given: dict[str, object], words: str, tmp_path: Path) -> None:
     with refused(ConfigError, words):
-        candidates.DesignRequest(robot=file_of(tmp_path, name), **given).candidates()
+        candidates.DesignRequest(robot=file_of(tmp_path, name), limits=given).candidates()
 
 
 @pytest.mark.parametrize(
     ("given", "name"),
     [
         ({"source": "data", "robot": "robot.yaml"}, "--robot robot.yaml"),
-        ({"source": "data", "max_speed": 1.0}, "--max-speed"),
+        ({"source": "data", "limits": {"max_speed": 1.0}}, "--max-speed"),
         ({}, "--robot FILE"),
     ],
 )

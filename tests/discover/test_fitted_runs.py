@@ -639,13 +639,13 @@ def test_whichever_of_the_look_alikes_is_right_is_named_after_the_proposed_runs(
 
 def test_candidates_are_no_faster_and_steer_no_farther_than_what_was_recorded() -> None:
     fit = steered_half(plain_fit(driven(TRICYCLE)))
-    candidates = candidate_runs(fit, [effects.create("heading_drift")])
+    candidates = candidate_runs(fit, [effects.create("heading_drift")], 0.05)
     assert len({candidate.timed.command.speed for candidate in candidates}) > 2
     assert any(candidate.timed.command.turn_rate for candidate in candidates)
     for quantity in ("rates", "steering"):
         done, asked = (
             [np.abs(getattr(run, quantity)).max() for run in runs]
-            for runs in (fit.runs, [candidate.run for candidate in candidates])
+            for runs in (fit.runs, [candidate.runs[0] for candidate in candidates])
         )
         assert max(asked) <= max(done) * 1.0001
 
@@ -659,7 +659,7 @@ def steered_half(fit: fitting.Fit) -> fitting.Fit:
 def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
     fit = plain_fit(driven(DIFFERENTIAL))
     headings = {
-        name: {candidate.run.start[2] for candidate in candidate_runs(fit, [effects.create(name)])}
+        name: {candidate.runs[0].start[2] for candidate in candidate_runs(fit, [effects.create(name)], 0.05)}
         for name in ("heading_drift", "floor_drift")
     }
     assert len(headings["heading_drift"]) == 1
@@ -669,14 +669,15 @@ def test_headings_matter_only_to_effects_that_depend_on_them() -> None:
 def test_steering_is_turned_within_a_run_where_its_play_is_in_doubt() -> None:
     fit = plain_fit(driven(TRICYCLE))
     steady, weaving = (
-        candidate_runs(fit, [effects.create(name)])[0].run.steering for name in ("heading_drift", "steering_play")
+        candidate_runs(fit, [effects.create(name)], 0.05)[0].runs[0].steering
+        for name in ("heading_drift", "steering_play")
     )
     assert np.ptp(steady) == 0 < np.ptp(weaving)
 
 
 def test_effects_that_nothing_tells_apart_are_listed_with_all_that_each_looks_like() -> None:
     choice = Choice(np.array([1]), 0.6, 0.0, np.eye(3, dtype=bool))
-    said = description_of("abc", 1, 0.5, choice, [("a", "b"), ("a", "c"), ("b", "c")])
+    said = description_of("abc", 0.5, choice, [("a", "b"), ("a", "c"), ("b", "c")])
     assert said.endswith("surely tells a from b or c; nor b from c.")
 
 

@@ -146,7 +146,7 @@ BELOW = {
     "check": {"robot", "data", "fit"},
     "design": {"robot", "data", "slam", "simulate", "fit", "report"},
     "compare": {"robot", "data", "slam", "simulate", "fit", "report"},
-    "discover": {"robot", "data", "simulate", "fit", "report"},
+    "discover": {"robot", "data", "slam", "simulate", "fit", "report", "design"},
     "live": {"robot", "data", "simulate", "fit"},
     "testing": {"robot", "data", "fit"},
 }

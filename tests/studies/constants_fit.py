@@ -19,8 +19,8 @@ from interval_coverage import simulated, wheel_equations
 
 from omnibench.data.dataset import Dataset
 from omnibench.design.candidates import candidates_of_dataset
-from omnibench.design.design import Chosen, design_experiment
-from omnibench.design.report import effort_table, path_figures
+from omnibench.design.design import design_experiment
+from omnibench.design.report import effort_table
 from omnibench.fit.calibrate import CalibrationRun, calibrate
 from omnibench.fit.certify import certify_optimum
 from omnibench.fit.identifiability import identifiability
@@ -209,21 +209,10 @@ def answers_of_design() -> Answer:
 
 
 def answers_of_design_report() -> Answer:
-    """The report of a design from recordings of which a third are straight, as if every command were chosen.
-
-    lines: of the table against the number of runs. straight: how many commands are drawn so.
-    """
-    commands: dict[str, Any] = THREE["commands"]
-    config = FlowerConfig.model_validate(THREE | {"commands": commands | {"turn_rates": [-0.35, 0, 0.35]}})
-    design = design_experiment(candidates_of_dataset(simulate_dataset(config, "with straight runs").dataset))
+    """The report of a design from recordings. lines: of the table against the number of runs."""
+    design = design_experiment(candidates_of_dataset(recorded(3)))
     (of_set,) = design.sets
-    everything = of_set.model_copy(update={"chosen": tuple(Chosen(command=name, runs=1) for name in of_set.commands)})
-    (figure,) = path_figures(design.model_copy(update={"sets": (everything,)})).figures
-    straight = [trace for trace in figure.plot.data if trace.legendgroup == "straight" and trace.mode == "lines"]
-    return {
-        "lines": Value(kind="lines", values=(len(effort_table(design, of_set).rows),)),
-        "straight": Value(kind="straight", values=(len(straight),)),
-    }
+    return {"lines": Value(kind="lines", values=(len(effort_table(design, of_set).rows),))}
 
 
 def answers_of_few_runs() -> Answer:
