@@ -36,7 +36,9 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals, needed
 
 Stage = Literal["actuator", "wheel", "steering", "clock", "body", "world", "reference"]
-Need = Literal["wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "caster_rates"]
+Need = Literal[
+    "wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "servo_gaps", "caster_rates"
+]
 Values = Mapping[str, float]
 
 MOST_BYTES: Final = 48 * 1024  # decoded: with the rest of a calibration they fit in a request to the live node
