@@ -541,8 +541,12 @@ class Robot(Shown, Model):
 
     @property
     def reach(self) -> float:
-        """Mean distance of the wheels from the robot's centre, m: turning counts as the speed that it gives them."""
-        return float(np.mean([wheel.reach for wheel in self.measured]))
+        """Mean distance of the wheels from the robot's centre, m: turning counts as the speed that it gives them.
+
+        Of the wheels with a measured rate; of all of them where those stand in the centre, as that of a car with one.
+        """
+        measured = float(np.mean([wheel.reach for wheel in self.measured]))
+        return measured if measured > _ZERO else float(np.mean([wheel.reach for wheel in self.wheels]))
 
     @property
     def inverse_kinematic_matrix(self) -> Array:

@@ -198,6 +198,10 @@ _COVARIATES: dict[str, tuple[str, Callable[[Signals], Array | None]]] = {
     "wheel rate": ("fast wheels", lambda signals: np.abs(signals.rates)),
     "speed": ("fast driving", lambda signals: signals.speed),
     "turning": ("fast turning", lambda signals: np.abs(signals.twists[:, 2])),
+    "curvature": (
+        "turning on the spot",
+        lambda signals: 1 / (1 + signals.speed / np.maximum(np.abs(signals.twists[:, 2]) * signals.robot.reach, 1e-9)),
+    ),
     "acceleration": ("large accelerations", _total_acceleration),
     "centripetal acceleration": (
         "large centripetal accelerations",

@@ -52,7 +52,7 @@ class FloorMap(BodyEffect):
         *shared(_MODES, _POINTS, "grid points of the floor"),
         scale("centre_x", "m", -1e6, 1e6, 0.0, "middle of the map"),
         scale("centre_y", "m", -1e6, 1e6, 0.0, "middle of the map"),
-        Parameter("spacing", "m", 1e-3, 1e6, "between the grid's points", (0.3, 0.6, 1.2, 2.4)),
+        Parameter("spacing", "m", 1e-3, 1e6, "between the grid's points", (0.4, 1.0, 2.5)),
     )
 
     def correction(self, signals: Signals, values: Values) -> Array:

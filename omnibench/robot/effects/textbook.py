@@ -30,6 +30,8 @@ _FURGALE = (
     "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
 )
 
+# rad/s, preferred numbers (R10 of ISO 3) in the range of geared wheels; chosen
+_RATES = (3.15, 4.0, 5.0, 6.3, 8.0, 10.0, 12.5, 16.0, 20.0, 25.0, 31.5)
 _RADIUS_OF = "radius_"
 _STANDS = 3  # wheels around a robot, each with two neighbours
 _LEADS = 1e-3  # share of the rollers' angle by which wheels in one direction are put in their order
@@ -300,8 +302,7 @@ class MissedPulses(WheelEffect):
     form_covariates = ()
     fixed_parameters = (
         Parameter("k", "1", 0.0, 0.5, "share of the rate beyond the limit that is missed"),
-        # Preferred numbers R5 (ISO 3), from slow wheels to those of drones' carriers
-        Parameter("rate", "rad/s", 0.1, 1e3, "beyond which counts are missed", (2.5, 4.0, 6.3, 10.0, 16.0, 25.0)),
+        Parameter("rate", "rad/s", 0.1, 1e3, "beyond which counts are missed", _RATES),
     )
 
     def correction(self, signals: Signals, values: Values) -> Array:
