@@ -139,10 +139,9 @@ class IcrShift(BodyEffect):
 
 @effects.register("icr_curvature")
 class IcrCurvature(BodyEffect):
-    """The tracks of a skid-steered robot have other centres of rotation on the spot than on arcs: w (1 - k q) and more.
+    """A skid-steered robot has other centres of rotation on the spot than on arcs: w (1 - k q), vy - x q w.
 
-    v (1 - s q) and vy - x q w besides, with q = 1 / (1 + (R / R0)^2), R = abs(v) / abs(w) being the radius of the
-    path; what the matrix has is as on wide arcs.
+    q = 1 / (1 + (R / R0)^2), R = abs(v) / abs(w) being the radius of the path; what the matrix has is as on wide arcs.
     """
 
     physics = "On the spot all wheels slide across; on wide arcs some still grip, which brings the tracks nearer."
@@ -151,20 +150,19 @@ class IcrCurvature(BodyEffect):
         "scanner sensor, 2015 (ICR span as a function of the curvature)"
     )
     shows_in = "command"
-    form_covariates = ("curvature",)
+    form_covariates = ()
     only_for = "skid-steered robots"
     fixed_parameters = (
         Parameter("k", "1", -0.5, 0.5, "share of the turn that is lost on the spot, more than on wide arcs"),
         Parameter("x", "m", -0.2, 0.2, "way ahead of the centre of rotation on the spot, more than on wide arcs"),
-        Parameter("s", "1", -0.2, 0.2, "share of the speed that is lost on tight arcs"),
-        Parameter("R0", "m", 0.01, 1e3, "radius of the path at which half of that is left", (0.2, 0.5, 1.2)),
+        Parameter("R0", "m", 0.01, 1e3, "radius of the path at which half of that is left", (0.1, 0.2, 0.4, 0.8)),
     )
 
     def applies(self, robot: Robot) -> bool:
         return robot.skid
 
     def correction(self, signals: Signals, values: Values) -> Array:
-        ahead, left, turn = signals.twists.T
+        turn = signals.twists[:, 2]
         spot, away = np.square(values["R0"] * turn) + _STANDS**2, np.square(signals.speed)
-        changes = [-values["s"] * ahead, -values["s"] * left - values["x"] * turn, -values["k"] * turn]
-        return np.column_stack(changes) * (spot / (spot + away))[:, None]
+        changed = turn * spot / (spot + away)
+        return np.column_stack([0 * turn, -values["x"] * changed, -values["k"] * changed])

@@ -420,7 +420,7 @@ def test_tyres_lose_less_of_tight_turns_and_skid_steering_more() -> None:
     half = DIFFERENTIAL.wheels[0].y
     assert half is not None
     np.testing.assert_allclose(gained, [0.1 / (1 + half), 0.05 / 3, 0.0], rtol=1e-6, atol=1e-12)
-    lost = corrected("icr_curvature", SKID, curves(SKID, spot, wide, ahead), k=0.3, x=0.1, s=0.0, R0=1.0)
+    lost = corrected("icr_curvature", SKID, curves(SKID, spot, wide, ahead), k=0.3, x=0.1, R0=1.0)
     np.testing.assert_allclose(lost[:, 2], [-0.3, -0.15 / 5, 0.0], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(lost[:, 1], [-0.1, -0.05 / 5, 0.0], rtol=1e-6, atol=1e-12)
 
