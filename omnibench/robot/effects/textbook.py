@@ -30,8 +30,7 @@ _FURGALE = (
     "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
 )
 
-# rad/s, preferred numbers (R10 of ISO 3) in the range of geared wheels; chosen
-_RATES = (3.15, 4.0, 5.0, 6.3, 8.0, 10.0, 12.5, 16.0, 20.0, 25.0, 31.5)
+_RATES = (2.5, 4.0, 6.3, 10.0, 16.0, 25.0)  # rad/s, preferred numbers (R5 of ISO 3) of geared wheels; chosen
 _RADIUS_OF = "radius_"
 _STANDS = 3  # wheels around a robot, each with two neighbours
 _LEADS = 1e-3  # share of the rollers' angle by which wheels in one direction are put in their order

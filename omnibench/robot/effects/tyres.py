@@ -150,7 +150,7 @@ class IcrCurvature(BodyEffect):
         "scanner sensor, 2015 (ICR span as a function of the curvature)"
     )
     shows_in = "command"
-    form_covariates = ()
+    form_covariates = ("curvature",)
     only_for = "skid-steered robots"
     fixed_parameters = (
         Parameter("k", "1", -0.5, 0.5, "share of the turn that is lost on the spot, more than on wide arcs"),
@@ -164,5 +164,5 @@ class IcrCurvature(BodyEffect):
     def correction(self, signals: Signals, values: Values) -> Array:
         turn = signals.twists[:, 2]
         spot, away = np.square(values["R0"] * turn) + _STANDS**2, np.square(signals.speed)
-        changed = turn * spot / (spot + away)
-        return np.column_stack([0 * turn, -values["x"] * changed, -values["k"] * changed])
+        lost = turn * spot / (spot + away)
+        return np.column_stack([0 * turn, -values["x"] * lost, -values["k"] * lost])
