@@ -108,10 +108,14 @@ def _profile(time: Array) -> Array:
 
 
 def _told(time: Array, angle: float, turns: int) -> Array:
-    """Commanded steering angles (T,), rad: a step, turned to the other side so many times, and back to 0 at the end."""
-    begin, end = 0.6, SECONDS - 0.7
-    part = np.floor((time - begin) / (end - begin) * (turns + 1))
-    return np.where((time >= begin) & (time < end), angle * (-1.0) ** part, 0.0)
+    """Commanded steering angles (T,), rad: a step, turned to the other side so many times, and back to 0 at the end.
+
+    They change in the middle of a sample, so that the reading at its end is late by as much as it is early.
+    """
+    begin, end = 0.6 + SAMPLE / 2, SECONDS - 0.7 + SAMPLE / 2
+    switches = begin + SAMPLE * np.round(np.linspace(0, end - begin, turns + 2) / SAMPLE)
+    part = np.searchsorted(switches, time + STEP / 2) - 1
+    return np.where((part >= 0) & (part <= turns), angle * (-1.0) ** part, 0.0)
 
 
 def _driven(speeds: Array, told: Array, wheelbase: float, tyres: dict[str, float]) -> Array:
