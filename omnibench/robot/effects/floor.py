@@ -47,6 +47,9 @@ class FloorMap(BodyEffect):
     )
     shows_in = "place"
     needs = frozenset({"poses"})
+    # Not tried by discover, which cannot shape a map by the area that was driven: on the slippery patch of the foreign
+    # study 9100 it changed no answer, and made 54 more columns and 570 s of 72.
+    in_catalogue = False
     form_covariates = ()
     fixed_parameters = (
         *shared(_MODES, _POINTS, "grid points of the floor"),

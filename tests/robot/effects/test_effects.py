@@ -119,7 +119,7 @@ BY_HAND: dict[str, tuple[dict[str, float], list[float]]] = {
     "body_velocity_bias": ({"bx": 0.005, "by": -0.003}, [0.005, -0.003, 0.0]),
     "start_transient": ({"k": 0.2, "length": 0.05}, [-0.2 * VX * math.exp(-2), -0.2 * VY * math.exp(-2), 0.0]),
     "floor_drift": ({"dx": 0.02, "dy": -0.01}, [0.02 * SPEED, -0.01 * SPEED]),
-    # On grid point 22, where B(0)^2 is whole and its neighbour 12 has a quarter of that, and a quarter on the edge.
+    # On grid point 22; its neighbour's spline has a quarter of its peak there.
     "floor_map": (
         {f"{mode}_{x}{y}": 0.0 for mode in ("along", "rotation") for x in range(3) for y in range(3)}
         | {"along_22": 0.08, "along_12": 0.04, "rotation_22": 0.1, "centre_x": 0, "centre_y": 0, "spacing": 0.5},
@@ -128,7 +128,7 @@ BY_HAND: dict[str, tuple[dict[str, float], list[float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", MOTION)
+@pytest.mark.parametrize("name", [*MOTION, "floor_map"])
 def test_a_correction_is_the_formula_of_the_catalogue(name: str) -> None:
     values, expected = BY_HAND[name]
     term = make_term(name, values, APR_02)
