@@ -21,6 +21,10 @@ _SMOOTHING = 0.05  # s, time constant of the smoothed twist whose derivative is 
 # of usual encoders, and within the play of usual gears; chosen
 _TAKE_UP = 0.01
 _TRAIL = 0.05  # m, from a caster's pivot back to where its wheel touches the floor; chosen, as of small robots
+# Servos that commanded steering angles may have, one a time constant, s, and one a limit of the rate, rad/s: from those
+# of model cars (60 deg in 0.1 to 0.2 s at the arm, less at the wheels) to those of trucks; each twice the one before.
+SERVO_LAGS = (0.05, 0.1, 0.2, 0.4)
+SERVO_RATES = (0.5, 1.0, 2.0, 4.0, 8.0)
 _REVERSED = 0.05  # length of a caster's mean direction below which the side that it swings to is chance; chosen
 
 
@@ -39,7 +43,9 @@ class Signals:
 
     Of robots that steer: steering_rates (F, S): rates of the steering angles from one sample's end to the next, rad/s.
     steering_side (F, S): the side of its gear's play on which the motor stands, from -1 (it turned to the right last)
-    to 1 (to the left), 0 at first; None if no effect needs it. caster_rates (F,): rates at which a caster behind the
+    to 1 (to the left), 0 at first; None if no effect needs it. servo_gaps (F, S, 9): by how much servos turn a wheel
+    less far than they are told by the steering angle, mean over the sample, rad, of lags SERVO_LAGS and then of limits
+    SERVO_RATES; None if no effect needs it. caster_rates (F,): rates at which a caster behind the
     centre swings round, relative to the robot, to follow its motion, rad/s; None if no effect needs them.
     """
 
@@ -57,6 +63,7 @@ class Signals:
     steering: Array | None = None
     steering_rates: Array | None = None
     steering_side: Array | None = None
+    servo_gaps: Array | None = None
     caster_rates: Array | None = None
 
     @property
@@ -97,13 +104,16 @@ def signals_of_runs(
     """
     durations, rates = samples.durations, np.concatenate([log.rates for log in logs])
     ends = _joined([log.steering for log in logs])
-    steering, side, swings = None, None, None
+    steering, side, gaps, swings = None, None, None, None
     if ends is not None:
         before = samples.before(ends)
         before[samples.edges[:-1]] = ends[samples.edges[:-1]]
         steering = (before + ends) / 2
         if "steering_side" in needs:
             side = np.concatenate([_sides(angles) for angles in np.split(steering, samples.edges[1:-1])])
+        if "servo_gaps" in needs:
+            parts = zip(*(np.split(values, samples.edges[1:-1]) for values in (ends, durations)), strict=True)
+            gaps = np.concatenate([_gaps(*of_run) for of_run in parts])
     tracked = (rates if logs[0].drive is None else logs[0].drive.signals(rates, steering)) @ matrix.T
     twists = of_centre(robot, tracked)
     smoothed = _smoothed(twists, samples, smoothing_share(sample_period))
@@ -129,6 +139,7 @@ def signals_of_runs(
         steering=steering,
         steering_rates=None if ends is None else steering_rates(ends, steering, durations),
         steering_side=side,
+        servo_gaps=gaps,
         caster_rates=swings,
     )
 
@@ -169,6 +180,45 @@ class SteeringGears:
             self._wheel = angles
         self._wheel = np.maximum(np.minimum(self._wheel, angles + _TAKE_UP), angles - _TAKE_UP)  # clip is slow on few
         return (angles - self._wheel) / _TAKE_UP
+
+
+class SteeringServos:
+    """Servos that turn steered wheels to commanded angles u, one sample after another; all stand as told at first.
+
+    With u linear within samples of duration d, and s = (u_k - u_(k-1)) / d, the gap g = y - u of a lag tau is
+
+        g_k = (g_(k-1) + tau s) e - tau s,    e = exp(-d / tau),                                            (3)
+
+    and its mean over the sample -tau s + (g_(k-1) + tau s) (1 - e) tau / d. A servo that turns at the rate R at most
+    turns to u_k during the sample, as far as it gets, and its gap is the mean of those at both ends.
+    """
+
+    def __init__(self) -> None:
+        self._angles: list[float] | None = None
+        self._gaps: list[list[float]] = []  # of each wheel, of lags and of limits
+
+    def turned(self, angles: Sequence[float], duration: float) -> list[list[float]]:
+        """Mean gaps (S, 9) of a sample that ends at commanded angles (S,), rad, after a duration > 0 s."""
+        if self._angles is None:
+            self._angles = list(angles)
+            self._gaps = [[0.0] * (len(SERVO_LAGS) + len(SERVO_RATES)) for _ in angles]
+        means = []
+        for before, angle, gaps in zip(self._angles, angles, self._gaps, strict=True):
+            turned, of_wheel = angle - before, []
+            for number, tau in enumerate(SERVO_LAGS):
+                ahead = tau * turned / duration
+                from_ramp = gaps[number] + ahead
+                lost = -math.expm1(-duration / tau)
+                of_wheel.append(from_ramp * lost * tau / duration - ahead)
+                gaps[number] = from_ramp * (1 - lost) - ahead  # Eq. (3)
+            for number, rate in enumerate(SERVO_RATES, len(SERVO_LAGS)):
+                asked = turned - gaps[number]
+                gap = max(min(asked, rate * duration), -rate * duration) - asked
+                of_wheel.append((gaps[number] + gap) / 2)
+                gaps[number] = gap
+            means.append(of_wheel)
+        self._angles = list(angles)
+        return means
 
 
 class Caster:
@@ -240,6 +290,7 @@ class SignalStream:
         self._smoothed = np.zeros(3)
         self._angles = np.zeros(len(robot.wheel_names))
         self._gears = SteeringGears() if "steering_side" in needs else None
+        self._servos = SteeringServos() if "servo_gaps" in needs else None
         self._caster = Caster(robot) if "caster_rates" in needs else None
 
     def turn(self, angles: Array, wheel_angles: Array | None = None) -> None:
@@ -304,6 +355,9 @@ class SignalStream:
             steered,
             None if steering is None else steering_rates(steering[1][None], steered, durations),
             None if steering is None or self._gears is None else self._gears.turned(steering[0])[None],
+            None
+            if steering is None or self._servos is None
+            else np.array([self._servos.turned(steering[1].tolist(), duration)]),
             None if self._caster is None else np.array([self._caster.moved(twist.tolist(), duration)]),
         )
 
@@ -328,6 +382,12 @@ def _sides(angles: Array) -> Array:
     """Sides (F, S) of its gears' play on which a run's steering motors stand, at angles (F, S), rad."""
     gears = SteeringGears()
     return np.array([gears.turned(row) for row in angles])
+
+
+def _gaps(ends: Array, durations: Array) -> Array:
+    """Mean gaps (F, S, 9) of servos in a run that were told the angles (F, S), rad, at the samples' ends."""
+    servos = SteeringServos()
+    return np.array([servos.turned(*sample) for sample in zip(ends.tolist(), durations.tolist(), strict=True)])
 
 
 def _swings(robot: Robot, twists: Array, durations: Array) -> Array:

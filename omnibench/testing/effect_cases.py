@@ -14,7 +14,7 @@ import numpy as np
 from omnibench.registry import effects
 from omnibench.robot.effects import effect as contract
 from omnibench.robot.kinematics import Array, Robot, in_the_middle
-from omnibench.robot.signals import Caster, Signals, SteeringGears
+from omnibench.robot.signals import Caster, Signals, SteeringGears, SteeringServos
 from omnibench.testing.cases import Conformance, global_random_fingerprint, global_random_state, require
 from omnibench.testing.synthetic import synthetic_robot, synthetic_robots
 
@@ -26,7 +26,7 @@ _KINDS = {
     "ReferenceEffect": (contract.ReferenceEffect, ("reference",)),
     "ActuatorEffect": (contract.ActuatorEffect, ("actuator",)),
 }
-_OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "caster_rates"}
+_OPTIONAL = {"wheel_angles", "session_time", "session", "poses", "steering_side", "servo_gaps", "caster_rates"}
 _ROUNDING = 1e-9  # relative to the largest value
 _NOTHING = 1e-12  # m, rad, rad/s: a smaller change is rounding
 _OMNI: Final = frozenset({synthetic_robot(3).name, synthetic_robot(4).name})
@@ -43,7 +43,7 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
     rates = 5 * speed * (np.sin(2 * ends[:, None] + phases[0]) + 0.3 * np.sin(9 * ends[:, None] + phases[1]))
     swings = 0.4 * speed * np.sin(3 * ends[:, None] + np.arange(len(robot.drive.steered)))  # rad
     steering = in_the_middle(swings) if robot.drive.steered else None
-    gears, caster = SteeringGears(), Caster(robot)
+    gears, servos, caster = SteeringGears(), SteeringServos(), Caster(robot)
     twists = robot.drive.signals(rates, steering) @ robot.inverse_kinematic_matrix.T
     middle = ends - PERIOD / 2
     # Headings of the twists, positions on a loop beside the origin.
@@ -64,6 +64,9 @@ def driven_signals(robot: Robot, samples: int = SAMPLES, speed: float = 1.0) -> 
         steering=steering,
         steering_rates=None if steering is None else np.diff(swings, axis=0, prepend=swings[:1]) / PERIOD,
         steering_side=None if steering is None else np.array([gears.turned(angles) for angles in steering]),
+        servo_gaps=None
+        if steering is None
+        else np.array([servos.turned(angles, PERIOD) for angles in swings.tolist()]),
         caster_rates=np.array([caster.moved(twist, PERIOD) for twist in twists.tolist()]),
     )
 

@@ -34,6 +34,7 @@ from omnibench.errors import DataError, PluginError
 from omnibench.registry import effects
 from omnibench.robot import corrections
 from omnibench.robot.calibration import EffectTerm, extended_model, read_calibration, write_calibration
+from omnibench.robot.corrections import needs_of
 from omnibench.robot.effects.effect import MOST_BYTES, MotionEffect, Stage, Values, decode_weights, make_term
 from omnibench.robot.effects.learned import unpacked
 from omnibench.robot.export.formats import export_calibration
@@ -71,7 +72,7 @@ def test_a_stamp_within_a_sample_has_its_share_of_the_sample(integration: Integr
     begin, end = log.times[2], log.times[3]
     durations = np.diff(log.times)
     before, within = chosen.poses([replace(log, stamps=np.array([begin, begin + 0.3 * (end - begin)]))])[0]
-    signals = signals_of(log, APR_02, chosen.matrix, PERIOD)
+    signals = signals_of(log, APR_02, chosen.matrix, PERIOD, needs_of(terms))
     rates, twist, drift = log.rates[3].copy(), np.zeros(3), np.zeros(2)
     for each in terms:
         added = each.effect.correction(signals, each.values)[3]

@@ -3,7 +3,8 @@
     python tests/studies/foreign_study.py --out foreign --seeds 9000 9001 [--only belt_ripple] [--table]
 
 Every recording is a job in the store --out, under the code that discovers: run again, it goes on where it was. What
-these simulators hide is in no catalogue: a confident name is a wrong one.
+these simulators hide follows no formula of the catalogue; where its cause has a name there, that name is right, and any
+other confident name is a wrong one.
 """
 
 from __future__ import annotations
@@ -20,7 +21,16 @@ from scipy.stats import binomtest
 from omnibench.jobs.backend_choice import BackendChoice, open_backend
 from omnibench.jobs.job import Failure, Job, JobWatch, ResultStore, content_key, run_jobs
 
-KINDS = ("cross_wheel_coupling", "slippery_patch", "belt_ripple", "swinging_payload", "tether_pull")
+KINDS = (
+    "cross_wheel_coupling",
+    "slippery_patch",
+    "belt_ripple",
+    "swinging_payload",
+    "tether_pull",
+    "turn_slip",
+    "understeer",
+    "skid_icr",
+)
 
 
 def main() -> None:
@@ -49,13 +59,17 @@ def _job(kind: str, seed: int) -> Job[Result]:
 
 def table(results: Sequence[Result]) -> list[str]:
     """One line for each kind, and one for all: rates with the 95 % intervals of Wilson, medians of the gap closed."""
-    lines = [f"{'kind':22}{'sets':>5} {'flagged':26}{'flagged, right place':26}{'confident wrong name':26}closed"]
+    lines = [
+        f"{'kind':22}{'sets':>5} {'flagged':26}{'flagged, right place':26}{'right name or class':26}"
+        f"{'confident wrong name':26}closed"
+    ]
     for kind in (*KINDS, "all"):
         members = [each for each in results if kind in (each.kind, "all")]
         if members:
             tests: tuple[Callable[[Result], bool], ...] = (
                 lambda each: each.flagged,
                 lambda each: each.flagged and each.located,
+                lambda each: each.named_right,
                 lambda each: each.misnamed,
             )
             rates = "".join(f"{_rate([test(each) for each in members]):26}" for test in tests)

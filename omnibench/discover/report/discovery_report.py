@@ -24,7 +24,7 @@ def discovery_report(discovery: Discovery, options: str) -> page.Document:
         ("alike", "What the data cannot tell", alike, alike_blocks(discovery)),
         ("evidence", "Evidence for and against", "Step 4, select: what each effect would explain.",
          evidence_blocks(discovery)),
-        ("better", "Errors before and after", "Step 5, confirm: on runs held out, down to the floor of the noise.",
+        ("better", "Errors before and after", "Step 5, confirm: down to the floor of the noise.",
          _errors(discovery)),
         ("parameters", "Parameters", "Step 6, conclude: the effects that were found.", parameter_blocks(discovery)),
         ("drive", "What to drive next", "The runs that tell look-alikes apart.", experiment_blocks(discovery)),

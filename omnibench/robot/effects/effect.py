@@ -36,7 +36,9 @@ from omnibench.robot.kinematics import Array, Robot
 from omnibench.robot.signals import Signals, needed
 
 Stage = Literal["actuator", "wheel", "steering", "clock", "body", "world", "reference"]
-Need = Literal["wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "caster_rates"]
+Need = Literal[
+    "wheel_angles", "session_time", "session", "targets", "poses", "steering_side", "servo_gaps", "caster_rates"
+]
 Values = Mapping[str, float]
 
 MOST_BYTES: Final = 48 * 1024  # decoded: with the rest of a calibration they fit in a request to the live node
@@ -196,6 +198,10 @@ _COVARIATES: dict[str, tuple[str, Callable[[Signals], Array | None]]] = {
     "wheel rate": ("fast wheels", lambda signals: np.abs(signals.rates)),
     "speed": ("fast driving", lambda signals: signals.speed),
     "turning": ("fast turning", lambda signals: np.abs(signals.twists[:, 2])),
+    "curvature": (
+        "turning on the spot",
+        lambda signals: 1 / (1 + signals.speed / np.maximum(np.abs(signals.twists[:, 2]) * signals.robot.reach, 1e-9)),
+    ),
     "acceleration": ("large accelerations", _total_acceleration),
     "centripetal acceleration": (
         "large centripetal accelerations",

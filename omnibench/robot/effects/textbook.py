@@ -1,8 +1,7 @@
-"""Effects of the textbook: on wheels and tread, slip, friction, mounting, drift, clocks, steering, and motors.
+"""Effects of the textbook: on wheels and tread, slip, friction, mounting, drift, clocks, and motors.
 
 Drift is motion that the wheel rates do not show: while driving, at the start of a run, or relative to the floor.
-A driven wheel whose rate is measured and that steers has two signals, in which an offset of its angle is a change of
-the matrix. The wheels of a car that only steer have one, in which an offset is none beyond small angles.
+Effects of steering are in steering.py, those of tyres in curves in tyres.py, those of the place in floor.py.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from numpy.typing import NDArray
 
 from omnibench.registry import effects
 from omnibench.robot.effects.effect import ActuatorEffect, MotionEffect, Parameter, ReferenceEffect, Values, body_change
-from omnibench.robot.kinematics import Array, CarDrive, Robot, class_of
+from omnibench.robot.kinematics import Array, Robot, class_of
 from omnibench.robot.signals import STILL, Signals, needed
 
-_PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
+PACEJKA = "H. B. Pacejka, Tire and Vehicle Dynamics"
 _BORENSTEIN = (
     "J. Borenstein and L. Feng, Measurement and correction of systematic odometry errors in mobile robots, 1996"
 )
@@ -30,12 +29,11 @@ _CENSI = (
 _FURGALE = (
     "P. Furgale, J. Rehder and R. Siegwart, Unified temporal and spatial calibration for multi-sensor systems, 2013"
 )
-_KALLASI = (
-    "F. Kallasi, D. Lodi Rizzini, F. Oleari, M. Magnani and S. Caselli, A novel calibration method for industrial "
-    "AGVs, 2017"
-)
 
+_RATES = (2.5, 4.0, 6.3, 10.0, 16.0, 25.0)  # rad/s, preferred numbers (R5 of ISO 3) of geared wheels; chosen
 _RADIUS_OF = "radius_"
+_STANDS = 3  # wheels around a robot, each with two neighbours
+_LEADS = 1e-3  # share of the rollers' angle by which wheels in one direction are put in their order
 _WOBBLES = 4  # wheels: three stand on any floor, of four one may be lighter
 KNEE = 0.05  # rad/s, half-width of the smoothed sign function; chosen
 
@@ -81,7 +79,7 @@ class SpeedDependentRadius(WheelEffect):
     """The radius of all wheels changes with their rate: r (1 + k abs(omega))."""
 
     physics = "A soft tread grows with the rate of its wheel, or is pressed flatter by what drives it."
-    source = f"{_PACEJKA} (effective rolling radius)"
+    source = f"{PACEJKA} (effective rolling radius)"
     shows_in = "wheel rate"
     fixed_parameters = (Parameter("k", "s/rad", -0.02, 0.02, "relative change of the radius per rad/s"),)
 
@@ -152,7 +150,7 @@ class AccelerationSlip(BodyEffect):
     """The robot falls behind while it accelerates: v - k dv/dt, in the robot's frame."""
 
     physics = "Slip of the wheels grows with the force that accelerates the robot."
-    source = f"{_PACEJKA} (longitudinal slip in proportion to the force)"
+    source = f"{PACEJKA} (longitudinal slip in proportion to the force)"
     shows_in = "acceleration"
     fixed_parameters = (Parameter("k", "s", 0.0, 0.1, "velocity that is lost per acceleration"),)
 
@@ -165,7 +163,7 @@ class CentripetalSlip(BodyEffect):
     """The robot slides across while it turns: v + k w x v."""
 
     physics = "Slip of the wheels grows with the force that keeps the robot on its curve."
-    source = f"{_PACEJKA} (side slip in proportion to the force)"
+    source = f"{PACEJKA} (side slip in proportion to the force)"
     shows_in = "command"
     form_covariates = ("centripetal acceleration",)
     fixed_parameters = (
@@ -184,7 +182,7 @@ class LoadTransfer(WheelEffect):
     """
 
     physics = "Accelerating shifts the robot's weight from wheel to wheel, and a tread gives way under load."
-    source = f"{_PACEJKA} (effective rolling radius under load)"
+    source = f"{PACEJKA} (effective rolling radius under load)"
     shows_in = "acceleration"
     fixed_parameters = (Parameter("k", "s2/m", 0.0, 0.3, "relative change of the radius per acceleration"),)
 
@@ -227,34 +225,6 @@ class QuadraticRotationSlip(BodyEffect):
         return body_change(signals, turning=-values["k"] * rate_of_turn * np.abs(rate_of_turn))
 
 
-@effects.register("icr_shift")
-class IcrShift(BodyEffect):
-    """The faster a skid-steered robot turns, the farther ahead it has its centre of rotation: vy - x w abs(w).
-
-    What the rate of turn itself loses by wider tracks is quadratic_rotation_slip.
-    """
-
-    physics = "The floor's friction across the wheels turns with their load, which turning shifts between the axles."
-    source = (
-        "A. Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, 2007; J. Pentzer, S. Brennan "
-        "and K. Reichard, Model-based prediction of skid-steer robot kinematics using online estimation of track "
-        "instantaneous centers of rotation, 2014"
-    )
-    shows_in = "command"
-    form_covariates = ("turning",)
-    only_for = "skid-steered robots"
-    fixed_parameters = (Parameter("x", "m s/rad", -0.1, 0.1, "way ahead of the centre of rotation per rate of turn"),)
-
-    def applies(self, robot: Robot) -> bool:
-        return robot.skid
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        rate_of_turn = signals.twists[:, 2]
-        added = np.zeros(signals.twists.shape)
-        added[:, 1] = -values["x"] * rate_of_turn * np.abs(rate_of_turn)
-        return added
-
-
 @effects.register("light_wheel")
 class LightWheel(EachWheelEffect):
     """A wheel that stands lightly slips in proportion to the force that is asked of it: omega - k_i a.u_i / r.
@@ -264,7 +234,7 @@ class LightWheel(EachWheelEffect):
     """
 
     physics = "Four wheels or more share the weight as floor and frame will have it; grip goes with a wheel's share."
-    source = f"{_PACEJKA} (slip stiffness in proportion to the load)"
+    source = f"{PACEJKA} (slip stiffness in proportion to the load)"
     shows_in = "acceleration"
     only_for = "robots on four measured wheels or more"
     for_each_wheel = (Parameter("k", "s", 0.0, 0.1, "rim speed that is lost per acceleration"),)
@@ -319,6 +289,60 @@ class CoulombCreep(WheelEffect):
 
     def correction(self, signals: Signals, values: Values) -> Array:
         return values["c"] * _smooth_sign(signals.rates) * (signals.speed[:, None] / signals.robot.radii)
+
+
+@effects.register("missed_pulses")
+class MissedPulses(WheelEffect):
+    """A wheel turns faster than is counted beyond some rate: omega + k max(abs(omega) - rate, 0) sign(omega)."""
+
+    physics = "Edges of an encoder that come faster than the controller serves them are not counted."
+    source = "P. Stoffregen, Encoder Library for Teensy and Arduino (edges per second that interrupts can serve)"
+    shows_in = "wheel rate"
+    form_covariates = ()
+    fixed_parameters = (
+        Parameter("k", "1", 0.0, 0.5, "share of the rate beyond the limit that is missed"),
+        Parameter("rate", "rad/s", 0.1, 1e3, "beyond which counts are missed", _RATES),
+    )
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        rates = signals.rates
+        return values["k"] * (rates - np.clip(rates, -values["rate"], values["rate"]))
+
+
+@effects.register("cross_wheel_coupling")
+class CrossWheelCoupling(WheelEffect):
+    """A wheel on rollers slips the more, the faster its neighbours j and l turn, next and previous counter-clockwise:
+
+    omega_i - omega_i (k_next abs(omega_j) + k_previous abs(omega_l)) - k_both sign(omega_i) abs(omega_j omega_l).
+    """
+
+    physics = "A slack chassis, and drag of the rollers, let a wheel's load and grip go with what its neighbours do."
+    source = (
+        "R. L. Williams II, B. E. Carter, P. Gallina and G. Rosati, Dynamic model with slip for wheeled "
+        "omnidirectional robots, 2002"
+    )
+    shows_in = "command"
+    form_covariates = ()
+    only_for = "robots on three wheels or more with rollers"
+    fixed_parameters = (
+        Parameter("k_next", "s/rad", -0.02, 0.02, "slip per rate of the next wheel counter-clockwise"),
+        Parameter("k_previous", "s/rad", -0.02, 0.02, "slip per rate of the next wheel clockwise"),
+        Parameter("k_both", "s/rad", -0.02, 0.02, "rate that is lost per product of both neighbours' rates"),
+    )
+
+    def applies(self, robot: Robot) -> bool:
+        return len(robot.wheel_names) >= _STANDS and all(wheel.kind in ("omni", "mecanum") for wheel in robot.measured)
+
+    def correction(self, signals: Signals, values: Values) -> Array:
+        # Mecanum wheels that are given by lever arms have one direction a side; rollers in an X tell which is ahead
+        wheels = signals.robot.measured
+        order = np.argsort([(wheel.outward - _LEADS * wheel.roller_angle) % (2 * np.pi) for wheel in wheels])
+        rates = signals.rates[:, order]
+        following, previous = (np.abs(np.roll(rates, step, axis=1)) for step in (-1, 1))
+        lost = np.empty(rates.shape)
+        lost[:, order] = (values["k_next"] * following + values["k_previous"] * previous) * rates
+        lost[:, order] += values["k_both"] * _smooth_sign(rates) * following * previous
+        return -lost
 
 
 @effects.register("lidar_lever_arm")
@@ -433,32 +457,6 @@ class WheelPosition(EachWheelEffect):
         robot = signals.robot
         along = np.cos([wheel.rolling for wheel in robot.measured])
         return of_wheels(robot, "y", values) * along / robot.radii * signals.twists[:, 2:]
-
-
-@effects.register("driven_steering_offset")
-class DrivenSteeringOffset(MotionEffect):
-    """Driven wheels that steer do not point straight ahead where the measured angle is 0: phi + c_i, for small c_i."""
-
-    stage = "steering"
-    physics = "The zero of each angle's encoder was set by eye or by a switch."
-    source = "twist = K u: an offset turns the pair omega cos phi, omega sin phi of signals"
-    shows_in = "command"
-    measurement = "a straight edge along each wheel's side at a measured angle of 0"
-    only_for = "robots with a driven wheel that steers"
-
-    def applies(self, robot: Robot) -> bool:
-        return any(pair >= 0 for pair in robot.drive.pairs)
-
-    def parameters(self, robot: Robot, sessions: tuple[str, ...] = ()) -> tuple[Parameter, ...]:  # noqa: ARG002
-        driven = [robot.drive.steered[pair] for pair in robot.drive.pairs if pair >= 0]
-        return tuple(
-            Parameter(f"c_{name}", "rad", -0.05, 0.05, f"true angle where 0 is measured, wheel {name}")
-            for name in driven
-        )
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        offsets = [values.get(f"c_{name}", 0.0) for name in signals.robot.drive.steered]
-        return np.tile(offsets, (len(needed(signals.steering)), 1))
 
 
 def _driving(rates: Array) -> NDArray[np.bool_]:
@@ -597,96 +595,6 @@ class ReferenceClockDrift(ReferenceEffect):
     def delays(self, stamps: Array, values: Values) -> tuple[Array, Array]:
         delay = values["offset"] + values["slope"] * stamps
         return delay, delay
-
-
-class _SteeringEffect(MotionEffect):
-    """An effect on the steering angles, the same for all of a robot's."""
-
-    stage = "steering"
-    only_for = "robots with a measured steering angle"
-
-    def applies(self, robot: Robot) -> bool:
-        return bool(robot.drive.steered)
-
-
-@effects.register("steering_gain")
-class SteeringGain(_SteeringEffect):
-    """Wheels steer by more than is measured, by a factor: phi (1 + g)."""
-
-    physics = "The ratio of the gear between the angle's encoder and the wheel, or of a linkage, is off."
-    source = _KALLASI
-    shows_in = "steering angle"
-    fixed_parameters = (Parameter("g", "1", -0.1, 0.1, "by how much the true angle is larger"),)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return values["g"] * needed(signals.steering)
-
-
-@effects.register("steering_play")
-class SteeringPlay(_SteeringEffect):
-    """Wheels stay behind when the steering turns back: phi - b s, s the side of the play, from -1 to 1.
-
-    The side changes over 20 mrad of the measured angle, and is not known (0) until the first turn of a run.
-    """
-
-    physics = "Gear and linkage have play between the angle's encoder and the wheel, and the floor holds the wheel."
-    source = "M. A. Krasnosel'skii and A. V. Pokrovskii, Systems with Hysteresis, 1989 (play operator)"
-    shows_in = "steering angle"
-    needs = frozenset({"steering_side"})
-    fixed_parameters = (Parameter("b", "rad", 0.0, 0.04, "half of the play"),)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return -values["b"] * needed(signals.steering_side)
-
-
-@effects.register("steering_lag")
-class SteeringLag(_SteeringEffect):
-    """Wheels follow the measured angle late: phi - tau d(phi)/dt; before it, where the angle is reported late."""
-
-    physics = "A linkage gives way under the torque that turns a wheel on the floor; or a bus delays the angle."
-    source = "first principles"
-    shows_in = "steering angle"
-    fixed_parameters = (Parameter("tau", "s", -0.2, 0.2, "time by which the wheel follows the measured angle"),)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return -values["tau"] * needed(signals.steering_rates)
-
-
-@effects.register("steering_offset")
-class SteeringOffset(_SteeringEffect):
-    """The wheels of a car do not point straight ahead where the measured angle is 0: phi + c."""
-
-    physics = "The zero of the steering was set by eye, or a linkage was bent or put together anew."
-    source = _KALLASI
-    shows_in = "steering angle"
-    only_for = "cars: on a driven wheel that steers, the matrix holds the offset"
-    fixed_parameters = (Parameter("c", "rad", -0.05, 0.05, "true angle where 0 is measured"),)
-
-    def applies(self, robot: Robot) -> bool:
-        return isinstance(robot.drive, CarDrive)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        return np.full(needed(signals.steering).shape, values["c"])
-
-
-@effects.register("steering_coupling")
-class SteeringCoupling(WheelEffect):
-    """Turning a module about its steering axis turns its drive encoder as well: omega + k d(phi)/dt."""
-
-    physics = "The motor drives the wheel by a gear that runs round the steering axis, and rolls on it when it steers."
-    source = "CTRE Phoenix 6, SwerveModuleConstants.CouplingGearRatio"
-    shows_in = "steering angle"
-    only_for = "robots with a driven wheel that steers"
-    fixed_parameters = (
-        Parameter("k", "1", -0.5, 0.5, "turn of the wheel per turn of the module that is not measured"),
-    )
-
-    def applies(self, robot: Robot) -> bool:
-        return any(pair >= 0 for pair in robot.drive.pairs)
-
-    def correction(self, signals: Signals, values: Values) -> Array:
-        pairs = np.array(signals.robot.drive.pairs)
-        return np.where(pairs < 0, 0.0, values["k"] * needed(signals.steering_rates)[:, pairs])
 
 
 @effects.register("motor_lag")

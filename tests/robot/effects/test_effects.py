@@ -67,6 +67,7 @@ def signals(**changes: Any) -> Signals:
         "wheel_angles": np.array([[0.5, 1.2, -2.0]]),
         "session_time": np.array([1000.0]),
         "session": "evening",
+        "poses": np.array([[0.5, 0.5, 0.1]]),
     }
     return Signals(**(chosen | changes))
 
@@ -96,6 +97,16 @@ BY_HAND: dict[str, tuple[dict[str, float], list[float]]] = {
     "coulomb_creep": ({"c": 0.02}, [0.02 * SPEED / R * sign for sign in (1, -1, math.tanh(0.8))]),
     "wheel_eccentricity": (AMPLITUDES, ripple(1)),
     "roller_ripple": (AMPLITUDES | {"rollers": 9}, ripple(9)),
+    "missed_pulses": ({"k": 0.5, "rate": 1.5}, [0.25, 0.0, 0.0]),
+    # Around the robot come a at 60 deg, b at 180 and c at 300.
+    "cross_wheel_coupling": (
+        {"k_next": 0.1, "k_previous": 0.01, "k_both": 0.001},
+        [
+            -0.2 * 1.0 - 0.02 * 0.04 - 0.001 * 0.04,
+            0.1 * 0.04 + 0.01 * 2.0 + 0.001 * 0.08,
+            -0.004 * 2.0 - 0.0004 * 1.0 - 0.001 * 2.0 * math.tanh(0.8),
+        ],
+    ),
     "thermal_radius_drift": ({"k": 1e-5}, [0.02, -0.01, 0.0004]),
     "tyre_wear": ({"radius_noon": 0.5, "radius_evening": 0.01}, [0.02, -0.01, 0.0004]),
     "load_transfer": ({"k": 0.1}, [-0.1 * towards(60) * 2, 0.1 * towards(180), -0.1 * towards(300) * 0.04]),
@@ -108,10 +119,16 @@ BY_HAND: dict[str, tuple[dict[str, float], list[float]]] = {
     "body_velocity_bias": ({"bx": 0.005, "by": -0.003}, [0.005, -0.003, 0.0]),
     "start_transient": ({"k": 0.2, "length": 0.05}, [-0.2 * VX * math.exp(-2), -0.2 * VY * math.exp(-2), 0.0]),
     "floor_drift": ({"dx": 0.02, "dy": -0.01}, [0.02 * SPEED, -0.01 * SPEED]),
+    # On grid point 22; its neighbour's spline has a quarter of its peak there.
+    "floor_map": (
+        {f"{mode}_{x}{y}": 0.0 for mode in ("along", "rotation") for x in range(3) for y in range(3)}
+        | {"along_22": 0.08, "along_12": 0.04, "rotation_22": 0.1, "centre_x": 0, "centre_y": 0, "spacing": 0.5},
+        [0.09 * VX, 0.09 * VY, 0.1 * W],
+    ),
 }
 
 
-@pytest.mark.parametrize("name", MOTION)
+@pytest.mark.parametrize("name", [*MOTION, "floor_map"])
 def test_a_correction_is_the_formula_of_the_catalogue(name: str) -> None:
     values, expected = BY_HAND[name]
     term = make_term(name, values, APR_02)
@@ -239,6 +256,14 @@ ONLY_FOR = {
     "steering_play": {"tricycle", "car", "swerve"},
     "steering_lag": {"tricycle", "car", "swerve"},
     "steering_offset": {"car"},
+    "steering_side_gain": {"tricycle", "car"},
+    "servo_lag": {"tricycle", "car"},
+    "servo_rate_limit": {"tricycle", "car"},
+    "understeer": {"car"},
+    "understeer_limit": {"car"},
+    "turn_slip": {"diff", "tricycle"},
+    "icr_curvature": {"skid"},
+    "cross_wheel_coupling": {"three", "four", "mecanum"},
     "steering_coupling": {"tricycle", "swerve"},
     "driven_steering_offset": {"tricycle", "swerve"},
     "icr_shift": {"skid"},
@@ -319,6 +344,93 @@ def test_a_light_wheel_slips_by_the_acceleration_along_its_drive(robot: Robot) -
     found = term.effect.correction(signals_of(log, robot, robot.inverse_kinematic_matrix, 0.1), term.values)
     # r omega cos g is the speed along the force, e: e.x = cos(-g), so that the rate lost is k a / r for any rollers.
     np.testing.assert_allclose(found[-1], [-0.1 / 0.05, 0, 0, 0], atol=1e-6)
+
+
+def told(rng: np.random.Generator, samples: int = 60) -> tuple[Array, Array]:
+    """Commanded angles (F,) at the samples' ends, rad, with jumps among them, and durations (F,), s."""
+    jumps = np.where(rng.random(samples) < 0.2, rng.normal(0, 0.5, samples), rng.normal(0, 0.02, samples))
+    return 0.2 + np.append(0.0, np.cumsum(jumps)[1:]), 0.02 * rng.uniform(0.5, 2.0, samples)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "slope"),
+    [
+        ("servo_lag", {"tau": 0.2}, lambda ahead: ahead / 0.2),
+        ("servo_rate_limit", {"rate": 2.0}, lambda ahead: np.clip(ahead / 1e-6, -2.0, 2.0)),
+    ],
+)
+def test_a_servo_follows_its_command_as_its_differential_equation_says(
+    name: str, shape: dict[str, float], slope: Callable[[float], float]
+) -> None:
+    ends, durations = told(np.random.default_rng(3))
+    log = replace(steered(CAR, ends), times=np.cumsum(durations))
+    found = corrected(name, CAR, log, share=1.0, **shape)[:, 0]
+    wheel, before, means = ends[0], ends[0], []
+    for end, duration in zip(ends, durations, strict=True):
+        behind, steps = 0.0, 2000
+        for step in range(steps):
+            angle = before + (end - before) * (step + 0.5) / steps
+            ahead = (angle if name == "servo_lag" else end) - wheel  # a limit is told the angle a sample early
+            turned = float(np.clip(slope(ahead) * duration / steps, -abs(ahead), abs(ahead)))
+            behind += (wheel + turned / 2 - angle) / steps
+            wheel += turned
+        means.append(behind)
+        before = end
+    # The angle that a servo reaches within a sample is taken to be reached at its end.
+    np.testing.assert_allclose(found, means, atol=1e-4 if name == "servo_lag" else 0.02)
+
+
+def test_servos_between_two_of_the_catalogue_are_between_their_paths() -> None:
+    ends, _ = told(np.random.default_rng(4))
+    quick, between, slow = (
+        corrected("servo_lag", CAR, steered(CAR, ends, 0.02), share=1.0, tau=tau) for tau in (0.1, 0.15, 0.2)
+    )
+    np.testing.assert_allclose(between, (quick + slow) / 2, atol=1e-12)
+
+
+def test_wheels_steer_farther_to_one_side() -> None:
+    found = corrected("steering_side_gain", CAR, steered(CAR, np.array([0.3, 0.3, -0.3, -0.3])), g=0.1, c=0.02)
+    np.testing.assert_allclose(found[[1, 3], 0], [0.03 + 0.02, 0.03 - 0.02], atol=1e-12)
+
+
+def curves(robot: Robot, *twists: tuple[float, float, float]) -> WheelLog:
+    """A sample of each twist of a car or another robot."""
+    rates, steering = robot.drive.commands(np.array(twists) @ robot.signal_equations.T)
+    times, held = 0.1 * np.arange(1, len(twists) + 1), np.repeat(steering, 2, axis=0)
+    if not steering.shape[1]:
+        return WheelLog(times, rates, np.zeros(3), times)
+    times = 0.1 * np.arange(1, 2 * len(twists) + 1)
+    return WheelLog(times, np.repeat(rates, 2, axis=0), np.zeros(3), times, steering=held, drive=robot.drive)
+
+
+def test_a_car_understeers_by_its_characteristic_speed_and_slides_at_the_limit() -> None:
+    log = curves(CAR, (3.0, 0.0, 0.5), (1.0, 0.0, -0.5))
+    turned = corrected("understeer", CAR, log, k=1 / 9, b=0.01, u=3.0)[1::2]
+    # Eq. (T1): half of the turn is left at the characteristic speed, 0.9 of it at a third.
+    np.testing.assert_allclose(turned[:, 2], [-0.25, 0.05], rtol=1e-9)
+    np.testing.assert_allclose(turned[:, 1], [-0.01 * 9 * 0.25, 0.01 * 0.45], rtol=1e-9)
+    beyond = corrected("understeer_limit", CAR, curves(CAR, (3.0, 0.0, 20.0), (0.1, 0.0, 0.1)), s=1.0, a=4.0)[1::2, 2]
+    assert 3.0 * (20.0 + beyond[0]) == pytest.approx(4.0, rel=1e-6)
+    assert abs(beyond[1]) < 1e-6
+
+
+def test_tyres_lose_less_of_tight_turns_and_skid_steering_more() -> None:
+    spot, wide, ahead = (0.0, 0.0, 1.0), (1.0, 0.0, 0.5), (1.0, 0.0, 0.0)
+    gained = corrected("turn_slip", DIFFERENTIAL, curves(DIFFERENTIAL, spot, wide, ahead), k=0.1, c0=1.0)[:, 2]
+    half = DIFFERENTIAL.wheels[0].y
+    assert half is not None
+    np.testing.assert_allclose(gained, [0.1 / (1 + half), 0.05 / 3, 0.0], rtol=1e-6, atol=1e-12)
+    lost = corrected("icr_curvature", SKID, curves(SKID, spot, wide, ahead), k=0.3, x=0.1, R0=1.0)
+    np.testing.assert_allclose(lost[:, 2], [-0.3, -0.15 / 5, 0.0], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(lost[:, 1], [-0.1, -0.05 / 5, 0.0], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", [MECANUM, ROBOTS["four"]], ids=lambda robot: robot.name)
+def test_neighbours_are_those_around_a_mecanum_robot(robot: Robot) -> None:
+    rates = np.array([[1.0, 10.0, 100.0, 1000.0]])  # front left and right, rear left and right
+    one = WheelLog(np.array([0.1]), rates, np.zeros(3), np.array([0.1]))
+    next_one = corrected("cross_wheel_coupling", robot, one, k_next=1.0, k_previous=0.0, k_both=0.0)
+    np.testing.assert_allclose(-next_one / rates, [[100.0, 1.0, 1000.0, 10.0]])
 
 
 def driven(robot: Robot, twists: Array, period: float = 0.02) -> WheelLog:
@@ -434,7 +546,7 @@ def test_what_is_wrong_is_told_in_one_line(case: str) -> None:
 
 
 def signals_in(log: WheelLog, robot: Robot) -> Signals:
-    needs = {"poses", "steering_side", "caster_rates"}
+    needs = {"poses", "steering_side", "servo_gaps", "caster_rates"}
     return signals_of(log, robot, robot.inverse_kinematic_matrix, PERIOD, needs)
 
 

@@ -60,7 +60,13 @@ def make(folder: Path, seed: int) -> dict[str, Any]:
     write(folder, robot, planned, recorded)
     # A product of two wheels' rates is a function of the command, and in part of a wheel's rate.
     covariates = ("wheel rate", "command")
-    return {"kind": "cross_wheel_coupling", "covariates": covariates, "size": size, "noncentrality": reached}
+    return {
+        "kind": "cross_wheel_coupling",
+        "covariates": covariates,
+        "right_names": ("cross_wheel_coupling",),
+        "size": size,
+        "noncentrality": reached,
+    }
 
 
 def _wheel(name: str, angle: float) -> dict[str, Any]:

@@ -38,8 +38,13 @@ def slots(commands: int, repetitions: dict[str, int], run: float, rng: np.random
 
 
 def write(folder: Path, robot: dict[str, Any], planned: Sequence[Slot], recorded: dict[str, Array]) -> None:
-    """Write the data set. recorded: times (T,), rates, angles (R, T, N), stamps (K,), poses (R, K, 3)."""
-    wheels = [wheel["name"] for wheel in robot["wheels"]]
+    """Write the data set.
+
+    recorded: times (T,), rates, angles (R, T, N), stamps (K,), poses (R, K, 3), and steering (R, T, S) of a robot whose
+    wheels steer and are not driven, where it has such.
+    """
+    wheels = [wheel["name"] for wheel in robot["wheels"] if wheel.get("driven", True)]
+    steered = [wheel["name"] for wheel in robot["wheels"] if wheel.get("type") == "steered"]
     names, times, stamps = [f"run{index:03d}" for index in range(len(planned))], recorded["times"], recorded["stamps"]
     header = {
         "format": "omnibench-dataset/1",
@@ -62,8 +67,9 @@ def write(folder: Path, robot: dict[str, Any], planned: Sequence[Slot], recorded
         }
     ).write_parquet(folder / "trajectories.parquet")
     columns: dict[str, Any] = {"trajectory": np.repeat(names, len(times)), "t": np.tile(times, len(names))}
-    for what, prefix in (("rates", "omega"), ("angles", "phi")):
-        columns |= {f"{prefix}_{wheel}": recorded[what][..., index].ravel() for index, wheel in enumerate(wheels)}
+    of_wheels = (("rates", "omega", wheels), ("angles", "phi", wheels), ("steering", "steer", steered))
+    for what, prefix, names_of in of_wheels:
+        columns |= {f"{prefix}_{wheel}": recorded[what][..., index].ravel() for index, wheel in enumerate(names_of)}
     pl.DataFrame(columns).write_parquet(folder / "wheels.parquet")
     columns = {"trajectory": np.repeat(names, len(stamps)), "t": np.tile(stamps, len(names))}
     columns |= {name: recorded["poses"][..., index].ravel() for index, name in enumerate(("x", "y", "theta"))}

@@ -59,7 +59,13 @@ def make(folder: Path, seed: int) -> dict[str, Any]:
     times = SAMPLE * np.arange(1, len(profile) + 1)
     recorded = {"times": times, "rates": measured, "angles": angles, "stamps": stamps, "poses": poses}
     write(folder, _robot(), planned, recorded)
-    return {"kind": "slippery_patch", "covariates": ("place",), "size": size, "noncentrality": reached}
+    return {
+        "kind": "slippery_patch",
+        "covariates": ("place",),
+        "right_names": ("floor_map",),
+        "size": size,
+        "noncentrality": reached,
+    }
 
 
 def _robot() -> dict[str, Any]:
