@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from omnibench.data.dataset import Trajectory
 from omnibench.discover.fine_structure import fine_structure
 from omnibench.discover.fit import (
     Extended,
@@ -103,7 +104,7 @@ class Confirmed:
 
 def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool = True) -> Confirmed:
     """Confirm the selected effects. unknown_term: add a term without a name where no name is sure."""
-    plain = selected.proposal.located.plain.fit
+    plain, whole = selected.proposal.located.plain.fit, selected.proposal.located.plain.whole
     screening, selection, extended = selected.screening, selected.selection, selected.extended
     if selection.chosen:  # once more, now that the noise is known better
         screening = screen(extended.fit, extended.residuals_without_effects, screening.groups)
@@ -146,9 +147,9 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
     # robots of the class usually have is in these, too, as in what ``calibrate`` gives
     explained = verdict in ("named", "class") and len(carried) == len(chosen)
     usual = None if explained else usual_effect(screening, plain.model.robot)
-    estimates = [(weight, _estimated(model, usual)) for weight, model in weighted]
+    estimates = [(weight, _estimated(model, usual, whole)) for weight, model in weighted]
     average = averaged(estimates)
-    baseline = most_probable(average.extended.fit, (), np.zeros(0))
+    baseline = most_probable(average.extended.fit, (), np.zeros(0), whole)
     if usual is not None and average.extended.groups == (usual,):  # alone, it is left out where it is next to nothing
         ends, errors = (
             np.array([of_run[-1] for of_run in values])
@@ -203,11 +204,14 @@ def usual_effect(screening: Screening, robot: Robot) -> Group | None:
     return next(groups, None) if physical_tolerance(robot).lost_rate else None
 
 
-def _estimated(model: Extended, usual: Group | None) -> Extended:
-    """The most probable values of a model, with the usual effect beside what it holds."""
+def _estimated(model: Extended, usual: Group | None, whole: Sequence[Trajectory] | None) -> Extended:
+    """The most probable values of a model, with the usual effect after the effects that have a name."""
     if usual is None or any(group.name == usual.name for group in model.groups):
-        return most_probable(model.fit, model.groups, model.values)
-    return most_probable(model.fit, [*model.groups, usual], np.append(model.values, np.zeros(len(usual.parameters))))
+        return most_probable(model.fit, model.groups, model.values, whole)
+    named = [group for group in model.groups if group.basis is None]
+    count = sum(len(group.parameters) for group in named)
+    values = np.concatenate([model.values[:count], np.zeros(len(usual.parameters)), model.values[count:]])
+    return most_probable(model.fit, [*named, usual, *model.groups[len(named) :]], values, whole)
 
 
 _NOTHING = 0.1  # share of the final errors: what the usual effect changes less is chance of the fit (chosen)

@@ -30,6 +30,7 @@ from omnibench.discover.significance import Group
 from omnibench.errors import DataError
 from omnibench.fit import noise as reference_noise
 from omnibench.fit import trajectory_fit as fits
+from omnibench.fit.calibrators.map import runs_of_estimate
 from omnibench.fit.estimate import (
     LOST_RATE,
     USUAL_NUISANCES,
@@ -72,11 +73,13 @@ def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
 class PlainFit:
     """The plain matrix, fitted to the training runs of a data set.
 
-    fit: the matrix at the runs, or at their windows, with the noise that it leaves.
+    fit: the matrix at the runs, or at their windows, with the noise that it leaves. whole: the runs that ``calibrate``
+    estimates by, where the fit's are windows of them.
     """
 
     dataset: Dataset
     fit: Fit
+    whole: tuple[Trajectory, ...] | None = None
 
 
 def thinned(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
@@ -108,13 +111,15 @@ def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> Plain
             )
         calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
         start = calibration.matrix_without_effects
-    recorded = dataset.split("train")
-    runs = thinned(fits.usable_runs(in_windows([run for run in recorded if run.has_poses]) or recorded))
+    recorded = [run for run in dataset.split("train") if run.has_poses]
+    runs = thinned(fits.usable_runs(in_windows(recorded) or dataset.split("train")))
     repeating: tuple[Trajectory, ...] = ()
     with suppress(DataError):  # none is usable
         others = reference_noise.repeating_runs(runs, dataset.split("validation"))
         repeating = thinned(fits.usable_runs(others, "validation"))
-    return PlainFit(dataset, fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating))
+    fit = fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating)
+    whole = None if len(runs) == len(recorded) else thinned(fits.usable_runs(runs_of_estimate(recorded)))
+    return PlainFit(dataset, fit, whole)
 
 
 _UNKNOWN_NOISE = reference_noise.NoiseEstimate(reference_noise.FIRST_NOISE, "within runs", 1, "")
@@ -529,12 +534,14 @@ def without_effects(plain: Fit, extended: Extended) -> Extended:
     return extend(at_model(extended.fit, plain.model), ()) if extended.groups else extended
 
 
-def most_probable(fit: Fit, groups: Sequence[Group], values: Array) -> Extended:
+def most_probable(
+    fit: Fit, groups: Sequence[Group], values: Array, whole: Sequence[Trajectory] | None = None
+) -> Extended:
     """Matrix and effects as ``calibrate`` estimates a matrix: weighed by what is known of the design, and robust.
 
     The estimate is that of fit/estimate.py, whose prior for a parameter is its largest plausible size, and for the lost
     rate that of the robot's class. Runs count as they are; outliers, by the loss. values (n,): of the effects'
-    parameters, to begin with.
+    parameters, to begin with. whole: the runs to estimate by, where those of the fit are windows of them.
     """
     robot, elements = fit.model.robot, fit.model.matrix.size
     tolerance = physical_tolerance(robot)
@@ -545,10 +552,11 @@ def most_probable(fit: Fit, groups: Sequence[Group], values: Array) -> Extended:
     )
     root, period = physical_prior_root(robot, tolerance), fit.model.sample_period
     assert period is not None
+    there = fit if whole is None else at_runs(fit, sorted(whole, key=lambda run: str(run.session)))
     problem = EstimateProblem(
-        robot, fit.runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES)
+        robot, there.runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES)
     )
-    still = replace(fit, nuisances=fits.Nuisances(np.zeros_like(fit.nuisances.values), fit.nuisances.deviations))
+    still = there.changed(nuisances=fits.Nuisances(np.zeros((len(there.runs), 3)), fit.nuisances.deviations))
     now, found, columns = np.append(fit.model.matrix, values), None, None
     for _ in range(_ROUNDS):
         model = model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:]))
@@ -574,12 +582,12 @@ def most_probable(fit: Fit, groups: Sequence[Group], values: Array) -> Extended:
             steps[inside] = estimated.root @ np.linalg.solve(others, estimated.scores[inside].sum(axis=0))
         return steps
 
-    there = at_model(fit, model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:])))
-    columns = columns_of(there, groups) if columns is None else columns
-    clusters, unit = Clusters.of(fit.runs), np.eye(found.root.shape[1])
+    clusters, unit = Clusters.of(there.runs), np.eye(found.root.shape[1])
     covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
-    data = there.whitened(columns)
-    return Extended(there, tuple(groups), data, columns, now[elements:], covariance, without_folds)
+    there = at_model(fit, model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:])))
+    columns = columns_of(there, groups) if columns is None or whole is not None else columns
+    data, of_folds = there.whitened(columns), without_folds if whole is None else None
+    return Extended(there, tuple(groups), data, columns, now[elements:], covariance, of_folds)
 
 
 def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:

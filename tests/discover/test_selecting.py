@@ -568,8 +568,8 @@ def test_most_of_the_gap_closes_on_a_held_out_session_by_a_step_without_a_name(
     assert (found.verdict, found.effects) == ("unknown", ())
     unnamed = {"smooth_heading", "smooth_course", "smooth_heading_wave"}
     assert {term.name for term in found.extended.effects} <= unnamed | {"wheel_dead_zone"}  # which its class has
-    assert [step.name for step in found.steps] == ["plain matrix", "+ unnamed, over heading"]
-    first, last = (step.held_out for step in found.steps)
+    assert [step.name for step in found.steps] == ["plain matrix", "+ wheel_dead_zone", "+ unnamed, over heading"]
+    first, *_, last = (step.held_out for step in found.steps)
     assert last < first
     assert len([note for note in found.notes if "unnamed term" in note]) == 1
 

@@ -7,6 +7,7 @@ wheel loses or gains (``wheel_dead_zone``): rollers creep, tyres slip in turns.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from omnibench.config import NonNegative, Positive
+from omnibench.data.dataset import Trajectory
 from omnibench.data.stored import drawn_runs
 from omnibench.errors import DataError
 from omnibench.fit import estimate as estimates
@@ -34,6 +36,13 @@ _MOST_SAMPLES = 1_000_000
 _WINDOW = 12.0
 _MOST_STEPS = 40  # steps that the progress of an estimate counts to
 _FORMER = ("start", "weights", "covariance", "tolerance")  # options of trajectory_ml
+
+
+def runs_of_estimate(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """The runs that an estimate is of: of very many some; of a single one, which says not how runs scatter, windows."""
+    runs = drawn_runs(trajectories, _MOST_SAMPLES)
+    single = len(runs) == 1 and runs[0].has_poses
+    return list(windows_of(runs[0], max(int(runs[0].end / _WINDOW), 1))) if single else list(runs)
 
 
 class MapOptions(Options):
@@ -83,9 +92,7 @@ class Map(Calibrator):
         if problem.tolerance is not None:  # only the elements are off their design then
             mount = mount or default_mount(robot)
             tolerance = replace(tolerance, radius=0.0, rows=(0.0, 0.0, 0.0), elements=problem.tolerance)
-        runs = drawn_runs(problem.trajectories, _MOST_SAMPLES)
-        if len(runs) == 1 and runs[0].has_poses:  # a single run does not say how far runs scatter, its windows do
-            runs = list(windows_of(runs[0], max(int(runs[0].end / _WINDOW), 1)))
+        runs = runs_of_estimate(problem.trajectories)
         lost = tolerance.lost_rate if options.lost_rate is None else options.lost_rate
         clock = (options.clock_offset * (options.clock != "none"), options.clock_slope * options.clock.count("slope"))
         loss = loss_of(problem.objective)
