@@ -146,18 +146,10 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
     # The estimates, of the plain matrix and of the average of all models; where something has no name, the effect that
     # robots of the class usually have is in these, too, as in what ``calibrate`` gives
     explained = verdict in ("named", "class") and len(carried) == len(chosen)
-    usual = None if explained else usual_effect(screening, plain.model.robot)
+    usual = None if explained or verdict == "none" else usual_effect(screening, plain.model.robot)
     estimates = [(weight, _estimated(model, usual, whole)) for weight, model in weighted]
     average = averaged(estimates)
     baseline = most_probable(average.extended.fit, (), np.zeros(0), whole)
-    if usual is not None and average.extended.groups == (usual,):  # alone, it is left out where it is next to nothing
-        ends, errors = (
-            np.array([of_run[-1] for of_run in values])
-            for values in (average.extended.fit.poses, average.extended.fit.residuals)
-        )
-        changes = ends - [of_run[-1] for of_run in baseline.fit.poses]
-        if np.linalg.norm(changes, axis=1).mean() < _NOTHING * np.linalg.norm(errors, axis=1).mean():
-            average = AveragedModel(baseline, ((1.0, baseline),))
     if explained:
         models = replace(models, used=estimates[0][1])
     # Where models disagree, or functions have no physics, they are not followed to motions that were not driven
@@ -214,7 +206,6 @@ def _estimated(model: Extended, usual: Group | None, whole: Sequence[Trajectory]
     return most_probable(model.fit, [*named, usual, *model.groups[len(named) :]], values, whole)
 
 
-_NOTHING = 0.1  # share of the final errors: what the usual effect changes less is chance of the fit (chosen)
 _UNCONFIRMED = 0.5  # probability, at most, of names by which held-out kinds of motion do not gain
 # Share of a column that must be left beyond the others, as in spline_term.py: much of a form is another matrix.
 _DETERMINED = 0.01
