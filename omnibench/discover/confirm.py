@@ -149,7 +149,9 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
     usual = None if explained or verdict == "none" else usual_effect(screening, plain.model.robot)
     estimates = [(weight, _estimated(model, usual, whole)) for weight, model in weighted]
     average = averaged(estimates)
-    baseline = most_probable(average.extended.fit, (), np.zeros(0), whole)
+    baseline = average.extended
+    if baseline.groups:
+        baseline = most_probable(baseline.fit, (), np.zeros(0), whole)
     if explained:
         models = replace(models, used=estimates[0][1])
     # Where models disagree, or functions have no physics, they are not followed to motions that were not driven
