@@ -32,7 +32,7 @@ from omnibench.robot.model import OdometryModel
 from omnibench.robot.odometry import Integration
 from omnibench.simulate import commands as motion
 from omnibench.simulate.commands import Command, Shapes, TimedCommand
-from omnibench.simulate.config import SteeringLimit
+from omnibench.simulate.config import RobotConfig, SteeringLimit
 from omnibench.simulate.robot_simulator import run_as_designed
 from omnibench.simulate.source import ComparedData
 from omnibench.words import noun_for
@@ -347,6 +347,11 @@ def read_candidates(
     if dataset is None and len(known) > 1:
         raise ConfigError(f"{path}: it has several data sets; choose one with --dataset: {', '.join(known)}")
     name = dataset or next(iter(known))
+    if isinstance(known[name].simulate, RobotConfig):
+        raise ConfigError(
+            f"{path}: data set {name} is a simulated robot, whose recordings take long to make; make them once with "
+            "`omnibench simulate`, and design from their folder"
+        )
     return candidates_of_dataset(
         known[name].load(name), integration or compared.integration, f"{path}: data set {name}"
     )

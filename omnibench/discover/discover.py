@@ -11,7 +11,7 @@ import numpy as np
 from omnibench.data.dataset import Dataset
 from omnibench.discover.conclude import conclude
 from omnibench.discover.confirm import confirm
-from omnibench.discover.fit import fit_plain
+from omnibench.discover.fit import fit_plain, start_matrix
 from omnibench.discover.locate import locate
 from omnibench.discover.propose import propose
 from omnibench.discover.result import Discovery
@@ -49,10 +49,11 @@ def discover_effects(
         require_type(calibration, Calibration, "read_calibration")
     for name in without:
         effects.entry(name, "without")
+    start = start_matrix(dataset, calibration)
     began, progress, rng = time.monotonic(), Stages(watch), np.random.default_rng(seed)
 
     progress.begin("fitting the plain matrix")
-    plain = fit_plain(dataset, calibration)
+    plain = fit_plain(dataset, start)
 
     progress.begin("locating what it leaves")
     located = locate(plain, without, rng)

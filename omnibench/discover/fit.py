@@ -95,22 +95,28 @@ def thinned(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
     return tuple(chosen)
 
 
-def fit_plain(dataset: Dataset, calibration: Calibration | None = None) -> PlainFit:
-    """Fit the plain matrix from the design, or from a calibration's matrix without effects.
+def start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
+    """The matrix (3, M) to begin at: the design's, or that of a calibration without effects.
 
-    Where no training run repeats a command, runs of the validation split that do tell the noise. DataError: there are
-    no reference poses, or the calibration is of another robot or holds effects whose plain matrix is not known.
+    DataError: the calibration is of another robot, or holds effects and its matrix without them is not known.
     """
-    start = dataset.robot.inverse_kinematic_matrix
-    if calibration is not None:
-        if calibration.effects and calibration.plain is None:
-            names = ", ".join(term.name for term in calibration.effects)
-            raise DataError(
-                f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
-                "matrix; give one without effects, such as the plain.yaml beside it, or none"
-            )
-        calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
-        start = calibration.matrix_without_effects
+    if calibration is None:
+        return dataset.robot.inverse_kinematic_matrix
+    if calibration.effects and calibration.plain is None:
+        names = ", ".join(term.name for term in calibration.effects)
+        raise DataError(
+            f"the calibration {calibration.name!r} holds effects already ({names}), and discover begins at a plain "
+            "matrix; give one without effects, such as the plain.yaml beside it, or none"
+        )
+    calibration.check_wheels(dataset.robot, f"the data set {dataset.name}")
+    return calibration.matrix_without_effects
+
+
+def fit_plain(dataset: Dataset, start: Array) -> PlainFit:
+    """Fit the plain matrix to the training runs, from a start (3, M). DataError: there are no reference poses.
+
+    Where no training run repeats a command, runs of the validation split that do tell the noise.
+    """
     recorded = [run for run in dataset.split("train") if run.has_poses]
     runs = thinned(fits.usable_runs(in_windows(recorded) or dataset.split("train")))
     repeating: tuple[Trajectory, ...] = ()
