@@ -68,7 +68,7 @@ from omnibench.discover.result import (
 from omnibench.discover.screening import Screening, screen
 from omnibench.discover.select import MotorEffects, Selected, Selection, select_effects
 from omnibench.discover.significance import Group, significance_of, together
-from omnibench.discover.spline_term import add_smooth_terms
+from omnibench.discover.spline_term import KINDS, add_smooth_terms
 from omnibench.fit.estimate import LOST_RATE
 from omnibench.fit.prior import physical_tolerance
 from omnibench.fit.trajectory_fit import given
@@ -177,16 +177,18 @@ def carried_over(
 ) -> tuple[Selection, frozenset[str]]:
     """The selection, and the names of its effects by which kinds of motion that were held out gain.
 
+    Effects of which not even the class is sure count where so many kinds were driven that functions without a name do.
     Of effects by which they do not, the names have even odds at most: on recordings of real robots no such effect held
     for another kind of path (tests/studies/real_discovery.py). folds (Z,): of whole kinds.
     """
     carried, weights = set[str](), dict(selection.weights)
     for group, alike in zip(selection.chosen, selection.confusable, strict=True):
         others = screening.index_with([other for other in selection.chosen if other is not group])
-        if is_confirmed(screening.data, others, group.index, folds):
-            carried.add(group.name)
-            continue
         whole = sum(weights.get(name, 0.0) for name in (group.name, *alike))
+        if is_confirmed(screening.data, others, group.index, folds):
+            if whole >= SURE or (screening.kinds or 0) >= KINDS:
+                carried.add(group.name)
+            continue
         for name in (group.name, *alike):
             weights[name] = weights.get(name, 0.0) * min(1.0, _UNCONFIRMED / max(whole, 1e-300))
     return replace(selection, weights=weights), frozenset(carried)

@@ -38,6 +38,7 @@ from omnibench.fit.estimate import (
     Linearisation,
     Nuisances,
     Unknown,
+    chosen_poses,
     estimate,
 )
 from omnibench.fit.intervals import Clusters, jackknife
@@ -73,8 +74,8 @@ def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
 class PlainFit:
     """The plain matrix, fitted to the training runs of a data set.
 
-    fit: the matrix at the runs, or at their windows, with the noise that it leaves. whole: the runs that ``calibrate``
-    estimates by, where the fit's are windows of them.
+    fit: the matrix at the runs, or at their windows, with the noise that it leaves. whole: the runs with the poses that
+    ``calibrate`` estimates by, where the fit's are windows of them or have others.
     """
 
     dataset: Dataset
@@ -124,7 +125,10 @@ def fit_plain(dataset: Dataset, start: Array) -> PlainFit:
         others = reference_noise.repeating_runs(runs, dataset.split("validation"))
         repeating = thinned(fits.usable_runs(others, "validation"))
     fit = fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating)
-    whole = None if len(runs) == len(recorded) else thinned(fits.usable_runs(runs_of_estimate(recorded)))
+    whole = None
+    if len(runs) != len(recorded) or any(len(run.pose_times) > _MOST_POSES for run in recorded):
+        estimated = fits.usable_runs(runs_of_estimate(recorded))
+        whole = tuple(fits.with_poses(run, np.append(0, chosen_poses(run))) for run in estimated)
     return PlainFit(dataset, fit, whole)
 
 
@@ -577,14 +581,14 @@ def most_probable(
             break
         columns = None if turned > _BENT else columns
     assert found is not None
-    estimated, whole = found, found.information.sum(axis=0) + np.eye(found.root.shape[1])
+    estimated, hessian = found, found.information.sum(axis=0) + np.eye(found.root.shape[1])
 
     def without_folds(folds: NDArray[np.intp]) -> Array:
         """One Gauss-Newton step of the estimate without the runs of each fold."""
         steps = np.zeros((len(folds), len(now)))
         for fold in np.unique(folds):
             inside = folds == fold
-            others = whole - estimated.information[inside].sum(axis=0)
+            others = hessian - estimated.information[inside].sum(axis=0)
             steps[inside] = estimated.root @ np.linalg.solve(others, estimated.scores[inside].sum(axis=0))
         return steps
 
@@ -592,7 +596,8 @@ def most_probable(
     covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
     there = at_model(fit, model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:])))
     columns = columns_of(there, groups) if columns is None or whole is not None else columns
-    data, of_folds = there.whitened(columns), without_folds if whole is None else None
+    same = whole is None or [run.id for run in whole] == [run.id for run in fit.runs]
+    data, of_folds = there.whitened(columns), without_folds if same else None
     return Extended(there, tuple(groups), data, columns, now[elements:], covariance, of_folds)
 
 

@@ -46,7 +46,7 @@ _FINE = 8  # bases of fine structure, at most: neighbours of the surest are amon
 # Kinds of motion without which a gain on those held out says nothing of other paths. On recordings of real robots terms
 # gained where 36 kinds were driven (robotino: a quarter of Eq. (6)), and lost with 4 to 8 of them (omni3's circles:
 # 107 mm to 112 mm on squares; diff: 7 mm to 17 mm), see tests/studies/real_discovery.py.
-_KINDS = 12
+KINDS = 12
 _FAMILIES = 2  # effects of the catalogue that are tried
 _ROUNDS = 3  # most terms that are added one after another: as many as effects are named
 _COVARIATES = 2  # covariates that are tried for a term: as many as a headline names
@@ -102,7 +102,7 @@ def add_smooth_terms(
     the command says nothing of others.
     """
     kinds, notes, terms = folds_of_kinds(plain), list[str](), list[Group]()
-    if (count := screening.kinds or 0) < _KINDS:
+    if (count := screening.kinds or 0) < KINDS:
         few = f"No unnamed term was tried: {plural(count, 'kind')} of motion cannot tell whether it holds for others."
         return SmoothTerm((), model, left, (few,))
     for _ in range(_ROUNDS):

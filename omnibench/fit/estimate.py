@@ -507,6 +507,11 @@ def _means(values: Array, firsts: NDArray[np.intp]) -> Array:
     return np.asarray(np.add.reduceat(values, firsts, axis=0) / counts)
 
 
+def chosen_poses(run: Trajectory) -> NDArray[np.intp]:
+    """Indices of the poses of a run that an estimate looks at."""
+    return _chosen(len(run.pose_times), _STRETCHES)[0]
+
+
 def _chosen(poses: int, stretches: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices of the poses of a run that are looked at, and of the first of each stretch among these.
 
