@@ -20,12 +20,13 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnibench.data.dataset import Dataset, Trajectory
-from omnibench.discover.paths import Paths, blocks_of, make_paths, slopes_by
+from omnibench.discover.paths import Paths, blocks_of, make_paths, slopes_by, slopes_by_matrix
 from omnibench.discover.significance import Group
 from omnibench.errors import DataError
 from omnibench.fit import noise as reference_noise
@@ -58,9 +59,6 @@ _SHORTEST = (
 )
 
 
-_MOST_POSES = 120  # reference poses of a run that are looked at; chosen
-
-
 def in_windows(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
     """The runs; where they are few, and no command is repeated, their parts of equal length."""
     repeated = any(len(members) > 1 for members in reference_noise.grouped([run.command or run.id for run in runs]))
@@ -81,19 +79,6 @@ class PlainFit:
     dataset: Dataset
     fit: Fit
     whole: tuple[Trajectory, ...] | None = None
-
-
-def thinned(runs: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
-    """The runs with at most 120 of their reference poses each, the first and the last among them.
-
-    More say no more of a robot than slip lets them, and the covariance of a run's poses takes time by their square.
-    """
-    chosen = []
-    for run in runs:
-        poses = len(run.pose_times)
-        index = np.round(np.linspace(0, poses - 1, _MOST_POSES)).astype(int)
-        chosen.append(run if poses <= _MOST_POSES else fits.with_poses(run, index))
-    return tuple(chosen)
 
 
 def start_matrix(dataset: Dataset, calibration: Calibration | None) -> Array:
@@ -119,16 +104,16 @@ def fit_plain(dataset: Dataset, start: Array) -> PlainFit:
     Where no training run repeats a command, runs of the validation split that do tell the noise.
     """
     recorded = [run for run in dataset.split("train") if run.has_poses]
-    runs = thinned(fits.usable_runs(in_windows(recorded) or dataset.split("train")))
+    runs = fits.usable_runs(in_windows(recorded) or dataset.split("train"))
     repeating: tuple[Trajectory, ...] = ()
     with suppress(DataError):  # none is usable
         others = reference_noise.repeating_runs(runs, dataset.split("validation"))
-        repeating = thinned(fits.usable_runs(others, "validation"))
+        repeating = fits.usable_runs(others, "validation")
     fit = fit_matrix(runs, dataset.robot, dataset.sample_period, start, repeating)
-    whole = None
-    if len(runs) != len(recorded) or any(len(run.pose_times) > _MOST_POSES for run in recorded):
-        estimated = fits.usable_runs(runs_of_estimate(recorded))
-        whole = tuple(fits.with_poses(run, np.append(0, chosen_poses(run))) for run in estimated)
+    estimated = sorted(runs_of_estimate(recorded), key=lambda run: (str(run.session), run.started_at or 0.0))
+    if [len(run.pose_times) for run in estimated] == [len(run.pose_times) for run in runs]:
+        return PlainFit(dataset, fit)
+    whole = tuple(fits.with_poses(run, np.append(0, chosen_poses(run))) for run in estimated)
     return PlainFit(dataset, fit, whole)
 
 
@@ -150,6 +135,7 @@ class Fit(fits.TrajectoryFit):
     then of these, that are no outliers; empty if there are none.
     """
 
+    span: ClassVar[float] = 0.1  # less encoder noise than over two samples; slower than the ramps of a motor
     noise: reference_noise.NoiseEstimate
     inliers: tuple[NDArray[np.bool_], ...] = ()
     noise_runs: tuple[Trajectory, ...] = ()
@@ -182,19 +168,6 @@ class Fit(fits.TrajectoryFit):
         pairs = zip(self.runs, self.masks, strict=True)
         runs = [run if mask.all() else fits.with_poses(run, np.append(True, mask)) for run, mask in pairs]
         return self.changed(runs=tuple(runs), inliers=(), noise_runs=())
-
-    @property
-    def velocities(self) -> list[Array]:
-        """Velocities (K, 3) between the poses, m/s, m/s, rad/s.
-
-        They take no further evaluation of a model with effects, and have less encoder noise than differences over two
-        samples, with which the class of the effect that omni3 lacks has a weight of 0.62 instead of 0.998.
-        """
-        velocities = []
-        for log, poses in zip(self.logs, self.poses, strict=True):
-            stamps = np.append(min(0.0, log.stamps[0] - 1e-3), log.stamps)
-            velocities.append(np.gradient(np.vstack([log.start, poses]), stamps, axis=0)[1:])
-        return velocities
 
     @cached_property
     def weightings(self) -> list[InlierWhitener]:
@@ -562,11 +535,9 @@ def most_probable(
     )
     root, period = physical_prior_root(robot, tolerance), fit.model.sample_period
     assert period is not None
-    there = fit if whole is None else at_runs(fit, sorted(whole, key=lambda run: str(run.session)))
-    problem = EstimateProblem(
-        robot, there.runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES)
-    )
-    still = there.changed(nuisances=fits.Nuisances(np.zeros((len(there.runs), 3)), fit.nuisances.deviations))
+    runs = tuple(whole or fit.runs)
+    problem = EstimateProblem(robot, runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES))
+    still = fits.TrajectoryFit(fit.model, runs, fits.Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
     now, found, columns = np.append(fit.model.matrix, values), None, None
     for _ in range(_ROUNDS):
         model = model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:]))
@@ -592,7 +563,7 @@ def most_probable(
             steps[inside] = estimated.root @ np.linalg.solve(others, estimated.scores[inside].sum(axis=0))
         return steps
 
-    clusters, unit = Clusters.of(there.runs), np.eye(found.root.shape[1])
+    clusters, unit = Clusters.of(runs), np.eye(found.root.shape[1])
     covariance = jackknife(found.information, found.scores, clusters, unit, found.root)
     there = at_model(fit, model_with(fit.model, now[:elements].reshape(3, -1), terms_of(groups, now[elements:])))
     columns = columns_of(there, groups) if columns is None or whole is not None else columns
@@ -612,25 +583,22 @@ def terms_of(groups: Sequence[Group], values: Array) -> list[Term]:
     return terms
 
 
-def columns_of(fit: Fit, groups: Sequence[Group]) -> tuple[Array, ...]:
+def columns_of(fit: fits.TrajectoryFit, groups: Sequence[Group]) -> tuple[Array, ...]:
     """Slopes (K, 3, n) of each run's poses by matrix elements and by the effects' parameters, about a fit."""
-    columns = fit.matrix_jacobian()
-    if not groups:
-        return tuple(columns)
     needs = frozenset().union(*(group.effect.needs for group in groups if group.effect is not None))
-    assert fit.model.sample_period is not None
-    of_groups: list[Array] = []
-    # The paths of some runs at a time, by the matrix alone.
+    model, period, columns = fit.model, fit.model.sample_period, list[Array]()
+    assert period is not None
+    # The paths of some runs at a time
     for first, last in blocks_of([len(log.times) for log in fit.logs], _TOGETHER):
         logs = fit.logs[first:last]
-        paths = make_paths(fit.model.robot, fit.model.matrix, logs, fit.model.sample_period, needs, first)
-        slopes = []
+        paths = make_paths(model.robot, model.matrix, logs, period, needs, first, model.motion_terms)
+        slopes = [slopes_by_matrix(paths)]
         for group in groups:
             assert isinstance(group.effect, MotionEffect | ReferenceEffect)
             base = {each.name: 0.0 for each in group.parameters} | dict(group.shapes)
             slopes.append(slopes_by(paths, group.effect, [each.name for each in group.parameters], base))
-        of_groups += split_by(np.concatenate(slopes, axis=2), [log.stamps for log in paths.logs])
-    return tuple(np.concatenate(both, axis=2) for both in zip(columns, of_groups, strict=True))
+        columns += split_by(np.concatenate(slopes, axis=2), [log.stamps for log in logs])
+    return tuple(columns)
 
 
 def columns_at(extended: Extended, runs: Sequence[Trajectory]) -> list[Array]:

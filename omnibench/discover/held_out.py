@@ -58,7 +58,6 @@ from omnibench.discover.fit import (
     inliers_of,
     model_with,
     most_probable,
-    thinned,
     values_of_other_folds,
 )
 from omnibench.discover.result import Extrapolation, Gap, HeldOut, Step
@@ -125,7 +124,7 @@ def validation_runs(dataset: Dataset, fit: Fit) -> ValidationRuns:
     if not able:
         return ValidationRuns((), (), tuple(warnings))
     try:
-        runs = thinned(usable_runs(able, "validation"))
+        runs = usable_runs(able, "validation")
     except DataError as error:
         warnings.append(f"{error}; nothing is compared on it.")
         return ValidationRuns((), (), tuple(warnings))

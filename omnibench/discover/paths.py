@@ -23,7 +23,8 @@ from scipy.sparse import csr_array
 
 from omnibench.errors import PluginError
 from omnibench.registry import effects
-from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, correction_of
+from omnibench.robot.corrections import corrected, corrected_twists, needs_of
+from omnibench.robot.effects.effect import MotionEffect, ReferenceEffect, Term, correction_of
 from omnibench.robot.effects.smooth import MODES, BentMap, SmoothEffect, direction
 from omnibench.robot.effects.textbook import ReferenceTimeOffset
 from omnibench.robot.kinematics import Array, Robot
@@ -60,6 +61,7 @@ class Paths:
     parts: tuple[slice, ...]
     ends: tuple[Array, ...]
     first: int
+    driven: Array  # (F, M): drive signals, rad/s
     _turns: Array  # (F, 4): cosine, sine, x and y from the run's start, each times the sample's duration
     lever: Array  # (S, 2): of the stamps, from the run's start
 
@@ -87,6 +89,7 @@ class Paths:
                 parts=tuple(slice(run.start - stamps.start, run.stop - stamps.start) for run in self.parts[first:last]),
                 ends=self.ends[first:last],
                 first=self.first + first,
+                driven=self.driven[samples],
                 _turns=self._turns[samples],
                 lever=self.lever[stamps],
             )
@@ -95,11 +98,6 @@ class Paths:
     def stamps(self) -> Array:
         """Times (S,) of the stamps, s."""
         return np.concatenate([log.stamps for log in self.logs])
-
-    @cached_property
-    def driven(self) -> Array:
-        """Drive signals (F, M) of all samples, rad/s."""
-        return self.robot.drive.signals(self.signals.rates, self.signals.steering)
 
     def of_twist(self, direction: Array, shares: Array) -> Array:
         """Slopes (S, 3, J) by changes direction (F, 3) times shares (F, J) of the tracked point's twist."""
@@ -225,11 +223,12 @@ def make_paths(
     sample_period: float,
     needs: Collection[str] | None = None,
     first: int = 0,
+    terms: Sequence[Term] = (),
 ) -> Paths:
-    """The paths of runs by a matrix alone, with exact arcs.
+    """The paths of runs by a matrix and effects of motion, with exact arcs.
 
     needs: signals to compute that only some effects need, by default those that any effect needs which applies to the
-    robot. first: number of the first run.
+    robot. first: number of the first run. terms: effects; the signals are those without them.
     """
     order = sorted(range(len(logs)), key=lambda index: str(logs[index].session))
     assert order == list(range(len(logs))), "runs come by session"
@@ -238,7 +237,7 @@ def make_paths(
     if needs is None:
         known_effects = [effects.create(entry.name) for entry in effects.entries()]
         needs = frozenset().union(*(effect.needs for effect in known_effects if effect.applies(robot)))
-    needs = frozenset(needs) - {"poses"}  # poses are computed in any case
+    needs = (frozenset(needs) | needs_of(terms)) - ({"poses"} - needs_of(terms))  # else poses are computed in any case
     of_sessions = [
         signals_of_runs(
             logs[low:high], RunSamples.of([log.times for log in logs[low:high]]), robot, matrix, sample_period, needs
@@ -253,7 +252,16 @@ def make_paths(
             joined[item.name] = None if any(value is None for value in values) else np.concatenate(values)
     signals = replace(of_sessions[0], **joined)
     driven = robot.drive.signals(signals.rates, signals.steering)
-    path = PathBatch(samples, starts, (driven @ matrix.T) * signals.durations[:, None], "arc")
+    twists, world = driven @ matrix.T, None
+    if terms:
+        corrections = [corrected(terms, each) for each in of_sessions]
+        driven = np.concatenate([robot.drive.signals(each.rates, each.steering) for each in corrections])
+        of_terms = [corrected_twists(terms, each, matrix) for each in of_sessions]
+        twists = np.concatenate([of_session for of_session, _ in of_terms])
+        if of_terms[0][1] is not None:
+            drift = np.concatenate([of_session for _, of_session in of_terms if of_session is not None])
+            world = drift * signals.durations[:, None]
+    path = PathBatch(samples, starts, twists * signals.durations[:, None], "arc", world)
     edges = np.cumsum([0, *(len(log.stamps) for log in logs)])
     parts = tuple(slice(int(low), int(high)) for low, high in pairwise(edges))
     middle, ends = path.middles, path.ends
@@ -274,6 +282,7 @@ def make_paths(
         parts=parts,
         ends=tuple(ends),
         first=first,
+        driven=driven,
         _turns=turns,
         lever=poses[:, :2] - starts[run, :2],
     )
@@ -316,6 +325,12 @@ def part_of(signals: Signals, part: slice, session: str | None) -> Signals:
     chosen: dict[str, Any] = {name: value[part] for name, value in values.items() if isinstance(value, np.ndarray)}
     chosen["session"] = session
     return replace(signals, **chosen)
+
+
+def slopes_by_matrix(paths: Paths) -> Array:
+    """Slopes (S, 3, 3M) by the elements of the matrix, row by row."""
+    driven = paths.driven
+    return np.concatenate([paths.of_twist(np.tile(row, (len(driven), 1)), driven) for row in np.eye(3)], axis=2)
 
 
 # tests/studies/constants.py varies it by 0.5 and 2: on a small set with heading drift no verdict and no name

@@ -35,7 +35,7 @@ from omnibench.data.dataset import Trajectory
 from omnibench.discover.covariates import Columns, generic_bases
 from omnibench.discover.fit import Extended, Fit, paths_of
 from omnibench.discover.held_out import folds_of_repetitions, is_confirmed, kinds_of_runs
-from omnibench.discover.paths import Paths, correction_along, slopes_by, slopes_by_corrections
+from omnibench.discover.paths import Paths, correction_along, slopes_by, slopes_by_corrections, slopes_by_matrix
 from omnibench.discover.significance import ColumnStore, Group, Significance, best_shapes, significance_of
 from omnibench.fit.noise import grouped
 from omnibench.fit.trajectory_fit import Given, Whitened, given
@@ -77,7 +77,7 @@ def make_groups(fit: Fit, without: Sequence[str]) -> Groups:
     """Groups and columns along the paths of a fit. without: names of effects that are not to be tried."""
     paths, trajectories = paths_of(fit, _COARSE), fit.runs
     named: list[Group] = []
-    sources: list[Columns] = [_of_matrix]
+    sources: list[Columns] = [slopes_by_matrix]
     not_looked_for: list[tuple[str, Missing]] = []
     sessions = tuple(dict.fromkeys(run.session for run in trajectories if run.session is not None))
     for effect in catalogue(without):
@@ -152,12 +152,6 @@ def _of_effect(
         return slopes_by_corrections(along, effect, every)
 
     return columns
-
-
-def _of_matrix(paths: Paths) -> Array:
-    """Slopes (S, 3, 3M) by the elements of the matrix, of the samples of the other columns."""
-    driven = paths.driven
-    return np.concatenate([paths.of_twist(np.tile(row, (len(driven), 1)), driven) for row in np.eye(3)], axis=2)
 
 
 def catalogue(without: Sequence[str]) -> Iterator[kinds.Effect]:

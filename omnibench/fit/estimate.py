@@ -480,12 +480,14 @@ class _LinearRows(_Rows):
         )
 
     def linearised(self, unknowns: Array) -> tuple[Array, Array]:
-        problem = self._problem
+        problem, elements = self._problem, len(self._problem.root)
         apart = self._errors + self._columns @ (problem.values(unknowns) - self._about)
-        scales = [unknown.deviation for unknown in problem.unknowns]
-        slopes, elements = _means(self._columns, self._firsts), len(problem.root)
-        by_elements = slopes[..., :elements] @ problem.root
-        return _medians(apart, self._firsts), np.concatenate([by_elements, slopes[..., elements:] * scales], axis=2)
+        errors = _medians(apart, self._firsts)
+        columns = [_means(self._columns[..., :elements], self._firsts) @ problem.root]
+        for number, unknown in enumerate(problem.unknowns):
+            further = apart + _STEP * unknown.deviation * self._columns[..., elements + number]
+            columns.append(((_medians(further, self._firsts) - errors) / _STEP)[..., None])
+        return errors, np.concatenate(columns, axis=2)
 
     def drifts(self, unknowns: Array) -> Array:  # noqa: ARG002
         deviations = self._problem.nuisances.deviations

@@ -41,7 +41,7 @@ import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import scipy
@@ -441,6 +441,7 @@ def _beyond(information: Array, scores: Array, total: Array, index: Sequence[int
 class TrajectoryFit:
     """A model at some runs, at their reference poses after the start. Quantities are lists with one entry a run."""
 
+    span: ClassVar[float] = 0.0  # s, to either side of a pose over which its velocity is taken
     model: OdometryModel
     runs: tuple[Trajectory, ...]
     nuisances: Nuisances
@@ -488,9 +489,10 @@ class TrajectoryFit:
     def velocities(self) -> list[Array]:
         """Velocities (K, 3) at the poses, m/s, m/s, rad/s.
 
-        They are differences over two samples: the rate of a single one has its full encoder noise.
+        They are differences over twice the span, and two samples at least: the rate of a single one has its full
+        encoder noise.
         """
-        period = median_period(self.runs)
+        period = max(median_period(self.runs), self.span)
         shifted = []
         for run, log in zip(self.runs, self.logs, strict=True):
             stamps = np.concatenate([log.stamps + period, log.stamps - period])
