@@ -212,7 +212,7 @@ _NOISE = Noise(pose_position=0.005, pose_heading=0.005, walk_position=0.003, wal
 
 
 class RobotLimits(Model):
-    """What a robot without recordings may drive, and how well it will be seen; None: the default."""
+    """Limits of what a robot without recordings may drive, and the noise of its reference; None: the default."""
 
     max_speed: Positive | None = Field(None, description="With --robot: its greatest speed, m/s. Default: 0.5.")
     max_turn_rate: Positive | None = Field(None, description="With --robot: its fastest turn, rad/s. Default: 1.")
@@ -283,7 +283,7 @@ class RobotLimits(Model):
 
 
 class DesignRequest(Model):
-    """What ``omnibench design`` was asked for: a data set or config, or a robot's file; None: not given."""
+    """The options of ``omnibench design``, whose source is a data set, a config or a robot's file."""
 
     source: Path | None = None
     use: Use = Field("trajectory", description="Reference poses to calibrate from: all of a run's, or its final one.")
@@ -301,7 +301,7 @@ class DesignRequest(Model):
         return self.model_dump(include={"use", "per", "runs", "repetitions", "dataset", "integration"})
 
     def candidates(self) -> Path | CandidatePool:
-        """What to design from: a data set or config, or the candidates of a robot's file.
+        """The data set or config to design from, or the candidates of a robot's file.
 
         ConfigError in one line: both or neither are given, options that go with the other, or a value that cannot be.
         """

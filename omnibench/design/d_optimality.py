@@ -103,10 +103,10 @@ class Candidates(Criterion):
         moment, cost = self.sum(counts), self.cost(counts)
         slopes = self.information.reshape(len(self), -1) @ np.linalg.inv(moment + self._ridge).ravel()
         pairs = np.meshgrid(np.flatnonzero(counts), np.flatnonzero(counts < self.most), indexing="ij")
-        given, taken = (each.ravel() for each in pairs)
-        costs = cost - self.costs[given] + self.costs[taken]
-        limits = self.merit(moment[None]) + slopes[taken] - slopes[given] - self.parameters * np.log(costs)
-        return np.column_stack([given, 0 * given + 1, taken, 0 * taken + 1]), costs, limits
+        removed, added = (each.ravel() for each in pairs)
+        costs = cost - self.costs[removed] + self.costs[added]
+        limits = self.merit(moment[None]) + slopes[added] - slopes[removed] - self.parameters * np.log(costs)
+        return np.column_stack([removed, 0 * removed + 1, added, 0 * added + 1]), costs, limits
 
     def identifies(self, counts: Array | Counts) -> bool:
         """True if ``counts`` runs (C,) determine every direction of the parameters."""

@@ -26,7 +26,7 @@ _BLOCK = 256  # designs that are tried at once
 
 
 class Criterion(ABC):
-    """What makes one design (C,) of candidate runs better than another.
+    """A criterion by which designs (C,), numbers of runs of each candidate, are compared.
 
     information (C, p, p): of one run of each candidate. costs (C,): of one run of each, > 0. An exchange takes runs of
     a candidate away and adds runs of another; it is a row of four numbers: the one, how many, the other, how many.
@@ -44,9 +44,9 @@ class Criterion(ABC):
 
     def sum_after(self, moment: Array, exchanges: Counts) -> Array:
         """The information (n, p, p) after exchanges (n, 4) in a design of information (p, p)."""
-        given, fewer, taken, more = exchanges.T
-        without = moment - fewer[:, None, None] * self.information[given]
-        return without + more[:, None, None] * self.information[taken]
+        removed, fewer, added, more = exchanges.T
+        without = moment - fewer[:, None, None] * self.information[removed]
+        return without + more[:, None, None] * self.information[added]
 
     def cost(self, counts: Array | Counts) -> Array:
         """The total costs (...) of counts (..., C) of runs."""
@@ -72,9 +72,9 @@ class Criterion(ABC):
 def after(counts: Counts, exchanges: Counts) -> Counts:
     """The designs (n, C) to which exchanges (n, 4) lead from one (C,)."""
     designs, rows = np.tile(counts, (len(exchanges), 1)), np.arange(len(exchanges))
-    given, fewer, taken, more = exchanges.T
-    designs[rows, given] -= fewer
-    designs[rows, taken] += more
+    removed, fewer, added, more = exchanges.T
+    designs[rows, removed] -= fewer
+    designs[rows, added] += more
     return designs
 
 

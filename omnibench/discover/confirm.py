@@ -104,7 +104,8 @@ class Confirmed:
 
 def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool = True) -> Confirmed:
     """Confirm the selected effects. unknown_term: add a term without a name where no name is sure."""
-    plain, whole = selected.proposal.located.plain.fit, selected.proposal.located.plain.whole
+    located = selected.proposal.located
+    plain, whole = located.plain.fit, located.plain.whole
     screening, selection, extended = selected.screening, selected.selection, selected.extended
     if selection.chosen:  # once more, now that the noise is known better
         screening = screen(extended.fit, extended.residuals_without_effects, screening.groups)
@@ -112,31 +113,35 @@ def confirm(selected: Selected, rng: np.random.Generator, *, unknown_term: bool 
         if not again.is_same_as(selection):
             extended = extend(plain, again.chosen)
         selection = again
-    selection, carried = carried_over(screening, selection, folds_of_kinds(plain))
     models = with_fitted_forms(plain, screening, competing_models(plain, selection, extended))
-    chosen = models.selection.chosen
-
-    # What the residuals depend on, before the effects and after them
-    baseline = without_effects(plain, models.used)
-    bases = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
-    without = together(bases, fine_structure(baseline.fit, rng))
-    beside = remaining(models.used, screening, rng) if chosen else without
-    where = dependences_on(without, "", screening.quantisation_chi_square)
-    left = dependences_on(beside, "still ", lambda group: screening.quantisation_chi_square(group, chosen))
-
-    # What is added: effects that hold for kinds of motion that were held out, and terms where no name is sure
+    selection, carried = carried_over(screening, models.selection, folds_of_kinds(plain))
+    models, chosen = replace(models, selection=selection), selection.chosen
     weighted = models.weighted
     if len(carried) < len(chosen):
         weighted = ((1.0, extend(plain, [group for group in chosen if group.name in carried])),)
-    motors, notes, term = selected.motors, tuple[str, ...](), None
+    used = weighted[0][1]
+
+    # What the residuals depend on, before the effects and after them
+    baseline = without_effects(plain, used)
+    bases = located.where
+    if screening is not located.screening:
+        bases = significance_of(screening.data, screening.groups.matrix.index, screening.groups.bases, rng)
+    without = together(bases, fine_structure(baseline.fit, rng))
+    beside = remaining(used, screening, rng) if used.groups else without
+    where = dependences_on(without, "", screening.quantisation_chi_square)
+    left = dependences_on(beside, "still ", lambda group: screening.quantisation_chi_square(group, used.groups))
+
+    # Where no name is sure, terms without one are added
+    motors, notes = selected.motors, tuple[str, ...]()
     folds = random_folds_of_repetitions(plain.runs, rng)
     verdict = verdict_of(named_effects(models, motors), where, left)
     if unknown_term and lacks_a_name(verdict):
-        used = weighted[0][1]
         term = add_smooth_terms(plain, screening, used, beside, lambda model: remaining(model, screening, rng), folds)
         notes = term.notes
         if term.terms:
-            left = dependences_on(term.left, "still ", lambda group: screening.quantisation_chi_square(group, chosen))
+            left = dependences_on(
+                term.left, "still ", lambda group: screening.quantisation_chi_square(group, used.groups)
+            )
             others = [(weight, extend(plain, [*model.groups, *term.terms])) for weight, model in weighted[1:]]
             weighted = ((weighted[0][0], term.model), *others)
     if motors is not None:

@@ -140,9 +140,9 @@ class Margins(Criterion):
         """All runs of a command for fewer of it, for none, or for some of another; limits are their times."""
         numbers = np.arange(counts.max(initial=0) + _MORE + 1)
         grid = np.meshgrid(np.flatnonzero(counts), np.arange(len(self)), numbers, indexing="ij")
-        given, taken, more = (each.ravel() for each in grid)
-        few_enough = (more <= counts[given] + _MORE) & ((more > 0) | (given == taken))
-        exchanges = np.column_stack([given, counts[given], taken, more])[few_enough]
+        removed, added, more = (each.ravel() for each in grid)
+        few_enough = (more <= counts[removed] + _MORE) & ((more > 0) | (removed == added))
+        exchanges = np.column_stack([removed, counts[removed], added, more])[few_enough]
         designs = after(counts, exchanges)
         often_enough = ((designs == 0) | (designs >= _LEAST_RUNS)).all(axis=1)
         costs = self.cost(designs[often_enough])

@@ -43,15 +43,13 @@ _DETECTED = 5.5  # Eq. (4) for a chance of 0.002 and 30 to 40 effects: 4.0 + 1.5
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Effects that could be missing.
+    """Effects that could be missing, those that a change of the matrix does not reproduce (``screening.tellable``).
 
-    candidates: the effects that a change of the matrix does not reproduce, each in all its shapes. absorbed: those that
-    it reproduces. not_looked_for: effects with what the recordings lack for them. classes: names of effects that look
-    alike. sums: effects, and the others that imitate each together.
+    absorbed: those that it reproduces. not_looked_for: effects with what the recordings lack for them. classes: names of
+    effects that look alike. sums: effects, and the others that imitate each together.
     """
 
     located: Located
-    candidates: tuple[Group, ...]
     absorbed: tuple[Absorbed, ...]
     not_looked_for: tuple[tuple[str, Missing], ...]
     classes: tuple[tuple[str, ...], ...]
@@ -74,7 +72,6 @@ def propose(located: Located) -> Proposal:
     start, visible = screening.beyond_matrix, screening.visible
     return Proposal(
         located,
-        tuple(screening.tellable),
         tuple(absorbed.values()),
         screening.groups.not_looked_for,
         _classes(start, visible),
@@ -116,9 +113,9 @@ def _made_by(start: Given, group: Group, *others: Group) -> float:
     index = [column for other in others for column in other.index]
     rows = list(group.index)
     roots = start.roots(index)
-    taken = start.information[np.ix_(rows, index)] @ roots
+    made = start.information[np.ix_(rows, index)] @ roots
     whole = float(np.trace(start.information[np.ix_(rows, rows)]))
-    return float(np.square(taken).sum()) / whole if whole > 0 else 0.0
+    return float(np.square(made).sum()) / whole if whole > 0 else 0.0
 
 
 def hidden_sizes(

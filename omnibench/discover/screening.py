@@ -174,12 +174,6 @@ def _lacks(effect: kinds.Effect, paths: Paths, sessions: tuple[str, ...]) -> Mis
     return None
 
 
-def check_names(names: Sequence[str]) -> None:
-    """Raises UnknownNameError for a name that is no effect's."""
-    for name in names:
-        effects.entry(name, "without")
-
-
 _FEWEST = 50  # samples in which a wheel turns (chosen): with fewer, the smallest gap need not be one tick
 _DECADES = 20.0  # -log10 of the chance, Eq. (2), that angles are multiples: no set of recordings has so many (chosen)
 _FINEST = 10_000  # ticks in the largest sample: a finer one is 0.01 % of the motion, less than a wheel slips
