@@ -536,7 +536,11 @@ def most_probable(
     root, period = physical_prior_root(robot, tolerance), fit.model.sample_period
     assert period is not None
     runs = tuple(whole or fit.runs)
-    problem = EstimateProblem(robot, runs, root, fit.model.integration, period, unknowns, Nuisances(*USUAL_NUISANCES))
+    heading, clock = USUAL_NUISANCES
+    if any(group.effect is not None and group.effect.stage == "reference" for group in groups):
+        clock = 0.0  # beside an offset of each run's clock, a delay of all runs would be hardly known
+    nuisances = Nuisances(heading, clock)
+    problem = EstimateProblem(robot, runs, root, fit.model.integration, period, unknowns, nuisances)
     still = fits.TrajectoryFit(fit.model, runs, fits.Nuisances(np.zeros((len(runs), 3)), np.zeros(3)))
     now, found, columns = np.append(fit.model.matrix, values), None, None
     for _ in range(_ROUNDS):

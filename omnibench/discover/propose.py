@@ -43,10 +43,10 @@ _DETECTED = 5.5  # Eq. (4) for a chance of 0.002 and 30 to 40 effects: 4.0 + 1.5
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Effects that could be missing, those that a change of the matrix does not reproduce (``screening.tellable``).
+    """Effects that could be missing: those that a change of the matrix does not reproduce (``screening.tellable``).
 
-    absorbed: those that it reproduces. not_looked_for: effects with what the recordings lack for them. classes: names of
-    effects that look alike. sums: effects, and the others that imitate each together.
+    absorbed: those that it reproduces. not_looked_for: effects with what the recordings lack. classes: names of effects
+    that look alike. sums: effects, and the others that imitate each together.
     """
 
     located: Located
