@@ -367,6 +367,11 @@ class Discovery(Shown):
         return bool(self.extended.effects)
 
     @property
+    def has_unnamed_term(self) -> bool:
+        """True if the extended model holds functions without a name."""
+        return any(step.name.startswith("+ unnamed") for step in self.steps)
+
+    @property
     def has_other_session(self) -> bool:
         """True if the validation split is known to be of another session."""
         names = set(self.trajectories)

@@ -82,7 +82,8 @@ def _tiles(discovery: Discovery) -> Iterator[page.Fact]:
     if discovery.verdict == "unknown" and discovery.effects:
         verdict = "likeliest, but no name is sure"
     elif discovery.verdict == "unknown" and discovery.extends:
-        verdict += "; a term without a name closes the gap as shown"
+        added = "a term without a name" if discovery.has_unnamed_term else "the rate that its class usually loses"
+        verdict += f"; {added} closes the gap as shown"
     if discovery.sessions.differences or discovery.sessions.doubts:
         verdict += ", sessions differ" if discovery.sessions.differences else ", sessions not compared"
     if not discovery.effects:

@@ -63,7 +63,7 @@ class DiscoveryResult(Result):
         kind, to = ("extended", "c_header") if discovery.extends else ("plain", "ros2_controllers")
         command = ("omnibench", "export", folder / CALIBRATION_FILES[kind], "--to", to)
         if discovery.extends:
-            what = "closes the gap without a name" if discovery.verdict == "unknown" else "holds what the matrix lacked"
+            what = "closes the gap without a name" if discovery.has_unnamed_term else "holds what the matrix lacked"
             then = "export it" if discovery.dataset.simulated else "use it on the robot"
             return NextStep(f"the extended calibration {what}", then, command)
         return NextStep("nothing was added to the matrix", "use the plain calibration", command)

@@ -144,7 +144,10 @@ def test_the_first_screen_says_how_sure_the_cause_is() -> None:
     assert "(rotation translation coupling; it may as well be load transfer)" in alike
     assert "found; which of a class is open; weight of the name 52.0 %" in alike
     assert "likeliest, but no name is sure" in whole(lambda: replace(named(), verdict="unknown")).text
-    assert "a term without a name closes" in whole(lambda: replace(named(), verdict="unknown", effects=())).text
+    nameless = replace(named(), verdict="unknown", effects=())
+    assert "the rate that its class usually loses closes" in whole(lambda: nameless).text
+    unnamed = tuple(replace(step, name="+ unnamed, over heading") for step in nameless.steps)
+    assert "a term without a name closes" in whole(lambda: replace(nameless, steps=unnamed)).text
 
 
 def test_errors_before_and_after_stand_beside_the_floor(report: Page) -> None:
