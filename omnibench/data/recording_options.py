@@ -50,20 +50,16 @@ def quantity_of(unit: str) -> Quantity:
     return "increments" if unit.endswith("/sample") else "positions"
 
 
+def read_robot(path: Path) -> Robot:
+    """The robot that a YAML file holds, by itself or among other things. ConfigError in one line: it holds none."""
+    content = read_yaml(path)
+    return validate(Robot, content.get("robot", content) if isinstance(content, Mapping) else content, str(path))
+
+
 def _load_robot(value: Any) -> Any:
     if value in (None, ""):
         raise ValueError("nothing is given; name the robot's YAML file, as robot=robot.yaml")
-    if not isinstance(value, str | Path):
-        return value
-    content = read_yaml(Path(value))
-    # A dataset.yaml and a calibration file hold the robot among other things.
-    return validate(Robot, content.get("robot", content) if isinstance(content, Mapping) else content, str(value))
-
-
-def read_robot(path: Path) -> Robot:
-    """The robot that a YAML file holds. ConfigError in one line: it holds none."""
-    robot: Robot = _load_robot(path)
-    return robot
+    return read_robot(Path(value)) if isinstance(value, str | Path) else value
 
 
 RobotOption = Annotated[Robot, BeforeValidator(_load_robot)]

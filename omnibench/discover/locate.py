@@ -32,7 +32,7 @@ _SHOWN = 0.01  # chance up to which a dependence is mentioned; verdicts count th
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """What the plain matrix leaves, and what that depends on.
+    """Residuals of the plain matrix, with all that could explain them and the covariates that they depend on.
 
     screening: columns of all that could explain it. where: significance of the generic bases. motors: what the wheel
     rates differ from their targets by, None where that is not known.

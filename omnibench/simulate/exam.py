@@ -73,7 +73,7 @@ _HOW_TO_ANSWER = (
 
 
 class ExamOptions(Model):
-    """What the sets of an exam are made of, besides the seed."""
+    """Options of an exam: its sets and what may be hidden in them."""
 
     sets: int = Field(12, gt=0, le=999, description="Number of data sets.")
     robots: tuple[str, ...] = Field(
@@ -228,7 +228,7 @@ def _draw_set(options: ExamOptions, rng: np.random.Generator) -> FlowerConfig:
 
 
 class EffectView:
-    """How effects show in the training runs of a config, beyond what the matrix can absorb, Eq. (1).
+    """The training runs of a config, in which effects show beyond what the matrix can absorb, Eq. (1).
 
     Effects act as in the catalogue, to first order; the sets themselves are driven by mechanics of their own.
     """
